@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import importlib.util
 import math
+import socket
+import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -108,6 +116,41 @@ def test_a_controller_that_is_wrong_by_sign_diverges() -> None:
     made.rotation = -made.rotation
     perform(simulation, touch, lambda _: touch.rows and abs(touch.rows[-1].force) > 5 * FORCE)
     assert made.tip[0] > HOLE[0]
+
+
+@pytest.mark.parametrize("is_its_own", [True, False])
+def test_a_server_whose_sensor_does_not_measure_what_is_sent_is_named(
+    is_its_own: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent, path = [Felt((0.0,) * 6)], tmp_path / "world"
+    if importlib.util.find_spec("mujoco") is None:
+        monkeypatch.setitem(sys.modules, "mujoco", mock.Mock())
+    example = importlib.import_module("docs.examples.mujoco.arm")
+    channel = MemoryChannel(Simulation(world=lambda _: sent[-1] if is_its_own else sent[0]))
+    world = mock.MagicMock()
+    world.__enter__().send = lambda _, *felt: sent.append(Felt(*felt))
+    for name, value in {
+        "time": SimpleNamespace(
+            monotonic=lambda: channel.monotonic_ns() * 1e-9,
+            sleep=lambda seconds: channel.wait(threading.Event(), seconds),
+        ),
+        "signal": mock.Mock(),
+        "World": lambda _: world,
+        "Client": lambda port: Client(port, channel=channel).connect(),
+    }.items():
+        monkeypatch.setattr(example, name, value)
+    robot = SimpleNamespace(step=lambda: sent[0], shown=contextlib.nullcontext)
+    task = SimpleNamespace(done=False)
+    task.update = lambda _, seconds: setattr(task, "done", seconds > 2.0)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as heard:
+        heard.bind(str(path))
+        with contextlib.nullcontext() if is_its_own else pytest.raises(SystemExit) as error:
+            example.perform(task, robot, argparse.Namespace(world=str(path), port=12001))
+    assert task.done == is_its_own
+    assert error is None or str(error.value) == (
+        f"the sensor at port 12001 does not measure what is sent to {path}: start ethercat-server virtual "
+        f'12001 --virtual "--world {path}", or give the --port of the server of that virtual sensor'
+    )
 
 
 @pytest.mark.long

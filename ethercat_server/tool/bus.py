@@ -35,7 +35,7 @@ def _adapters(args: argparse.Namespace) -> int:
             "ip_addresses": list(row.routes.addresses),
         } for row in found]})  # fmt: skip
         return DONE
-    rows = [("adapter", "state", "address", "")]
+    rows = [("adapter", "state", "address", "use")]
     for row in found:
         what = "loopback" if row.loopback else row.kind
         held = f"in use by {row.holder}" if row.holder else ""
@@ -116,7 +116,7 @@ def _eeprom(args: argparse.Namespace) -> int:
         if "error" not in row:
             say(f"slave {position}: {row['name'] or 'nameless'}")
             say(columns(_rows(row), indent=2))
-            say("\n".join(sii.raw_lines(bytes.fromhex(row["raw"]))))
+            say("\n".join(["word  bytes", *sii.raw_lines(bytes.fromhex(row["raw"]))]))
     for error in errors:
         note(error)
     return FAILED if errors else DONE

@@ -177,7 +177,7 @@ def _tare(args: argparse.Namespace) -> int:
         remember(found.identity.serial, tared["old_offset"], tared["new_offset"])
     except OSError as error:
         note(f"--undo will not know this tare: {error.strerror or error}")
-    rows: list[tuple[str, ...]] = [("", *(key.replace("_", " ") for key in keys), "")]
+    rows: list[tuple[str, ...]] = [("axis", *(key.replace("_", " ") for key in keys), "unit")]
     for n, axis in enumerate(AXES):
         rows.append((axis, *(f"{tared[key][n]:.4f}" for key in keys), "N" if n < 3 else "Nm"))
     lines = columns(rows, indent=2), _lasts(opened, in_server=_TARE_IN_SERVER)

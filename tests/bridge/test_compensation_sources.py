@@ -313,3 +313,29 @@ def test_an_orientation_of_a_topic_is_carried_on_to_the_sample(set_by_s: float) 
         if step > 2:
             wanted = 0.0, STANDARD_GRAVITY * math.sin(speed * t), STANDARD_GRAVITY * math.cos(speed * t)
             assert got == pytest.approx(wanted, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "lever"),
+    [
+        ("BFT-SENS-ECAT-M8", (0.0, 0.0, 0.0), (0.01, 0.02, 0.03 + 0.0257)),
+        ("BFT-MEGS-ECAT-M8", (0.0, 0.0, 0.0), (0.01, 0.02, 0.03 + 0.0456)),
+        ("another", (0.0, 0.0, 0.0), (0.01, 0.02, 0.03)),
+        ("BFT-SENS-ECAT-M8", (0.001, 0.0, 0.002), (0.009, 0.02, 0.028)),
+    ],
+)
+def test_the_lever_of_the_imu_is_that_of_the_model_or_as_given(
+    name: str, given: tuple[float, float, float], lever: tuple[float, float, float]
+) -> None:
+    """Of a sensor that turns at 10 rad/s about an axis between its own."""
+    source, rate = ImuSource((0.01, 0.02, 0.03), given), (6.0, -8.0, 4.0)
+    source.configure(InForce(SensorInfo(name=name, settings={}, rate_hz=800.0)))
+    spun = sample(acceleration=(1.0, 2.0, 9.0), angular_rate=rate)
+    for number in range(40):
+        found = source.specific_force(spun, number / 800.0, 0.0)
+    outward = [
+        sum(a * b for a, b in zip(rate, lever, strict=True)) * w - 116.0 * d
+        for w, d in zip(rate, lever, strict=True)
+    ]
+    assert found == pytest.approx([1.0 + outward[0], 2.0 + outward[1], 9.0 + outward[2]])
+    assert source.follow((0.0, 0.0, 0.0), rate, 0.05) is None, "it is off"

@@ -261,5 +261,10 @@ def test_messages_that_say_nothing_are_refused_with_their_number(tmp_path: Path)
     messages = [joint_states(START_NS + number, first=0.0, second=math.inf) for number in range(30)]
     (tmp_path / "arm.urdf").write_text(URDF)
     bag = write_bag(tmp_path / "bag", "/joint_states", messages)
-    with pytest.raises(RecordingError, match="but for 30 that do not tell how the link turned, are too few"):
-        _robot_rates(bag, "/joint_states", tmp_path / "arm.urdf", "tool")
+    few = write_bag(tmp_path / "few", "/joint_states", [joint_states(START_NS, first=0.0, second=0.0)])
+    for each, which in ((bag, ", but for 30 that do not tell how the link turned,"), (few, "")):
+        with pytest.raises(RecordingError) as error:
+            _robot_rates(each, "/joint_states", tmp_path / "arm.urdf", "tool")
+        assert str(error.value) == (
+            f"the messages of /joint_states in {each}{which} are too few, or not in the order of their stamps"
+        )

@@ -156,6 +156,21 @@ def tared(path: Path, told: Sequence[Any], steps: Sequence[float]) -> Path:
     return path
 
 
+@pytest.mark.parametrize("slow", ["acceleration_filter", "angular_rate_filter", ""])
+def test_what_is_forgotten_is_in_no_window_of_that_instant(slow: str) -> None:
+    """Whichever channel is the latest; nor is it kept."""
+    made, at = Windows(8), np.array([70 * PERIOD_NS])
+    chosen = SETTINGS | ({slow: 6} if slow else {"fir": True})
+    made.configure(InForce(SensorInfo(settings=chosen, rate_hz=RATE_HZ)))
+    made.add([frame(number) for number in range(120)])
+    before = made.at(at)
+    made.forget(int(at[0]))
+    for name, array in made.at(at).items():
+        assert array.tobytes() == before[name].tobytes(), name
+    made.forget(int(at[0]) + PERIOD_NS)
+    assert any(array.tobytes() != before[name].tobytes() for name, array in made.at(at).items())
+
+
 def test_a_bias_goes_with_the_sensors_own_offset(tmp_path: Path) -> None:
     """Tared before the recording and in it; then nobody knows the offset, and then it is known again."""
     tool = {"tool_mass": 0.0, "tool_center_of_gravity": [0, 0, 0], "bias": [3.0, 0, 0, 0, 0, 0]}

@@ -338,9 +338,43 @@ def test_the_servers_clients_have_rates_and_one_of_them_is_this(model: Model) ->
     assert state.server.uptime_s == 4568
 
 
+def test_what_is_known_of_the_server_is_that_of_its_last_connection() -> None:
+    model, spread = Model("here:1"), {"p50": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
+
+    def known(at_s: float) -> tuple[object, ...]:
+        state = model.state(at_s)
+        server = state.server
+        return server.connected, server.reason, server.since_s, server.heard_s, server.uptime_s, server.silent
+
+    model.gone("no server answers", 1.0)
+    assert known(3.0) == (False, "no server answers", 2.0, None, None, False)
+    made.connect(model, description(), made.OWN_PEER, 10.0)
+    assert known(10.25) == (True, "", 0.25, 0.25, None, False)
+    rows = [{"peer": peer, "sent": sent, "withheld": lost} for peer, sent, lost in CLIENTS]
+    model.add_status({**status(), "last_10s": {}, "wake_us": spread, "clients": rows}, 11.0)
+    assert known(11.5) == (True, "", 1.5, 0.5, 4567.5, True)
+    state = model.state(11.5)
+    assert [client.peer for client in state.clients] == [made.OWN_PEER, "c", "b", "a"]
+    assert (state.server.wake_us and state.server.wake_us[:2], state.server.exchange_us) == ((1.0, 2.0), None)
+    model.note_unread(0.0, False, 11.0)
+    assert known(11.75)[3] == 0.0, "until somebody has looked"
+    for _ in range(10):
+        model.add_event({"event": Event.SHUTTING_DOWN}, 12.0)
+    assert (known(12.25)[3], len(model.state(12.25).events)) == (0.0, 8)
+    for at_s, why in ((20.0, "it ended"), (25.0, "refused")):
+        model.gone(why, at_s)
+    assert known(26.0) == (False, "refused", 6.0, None, 4567.0, False)
+    assert model.state(26.0).clients == ()
+    made.connect(model, {**description(), "replay": {}}, made.OWN_PEER, 30.0)
+    assert model.state(30.0).server.replay == "a recording"
+
+
+CLIENTS = (("a", 5, 0), ("b", 9, 0), ("c", 1, 7), (made.OWN_PEER, 0, 0))
+
+
 def test_a_message_goes_after_half_a_minute(model: Model) -> None:
     model.say("Recorded 1 sample")
-    assert [bool(model.state(now(k * 1000)).message) for k in (0, 20, 40)] == [True, True, False]
+    assert [bool(model.state(now(0) + at_s).message) for at_s in (0, 29.9, 30.1)] == [True, True, False]
     model.say("Not tared")
     assert model.state(now(41 * 1000)).message is not None
 

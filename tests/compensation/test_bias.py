@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import random
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
@@ -26,6 +28,7 @@ from bota_ft_compensation.stationary import (
     NotStationaryError,
     StationaryMeans,
     StationaryWindow,
+    stationary_means,
 )
 from bota_ft_compensation.stream import obstacle
 from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, noisy, sample
@@ -101,6 +104,26 @@ def test_a_refusal_says_what_moved_by_how_much_and_what_the_limit_is(moved: Move
     collected = window(lambda k: noisy(noise, BIAS, **moved(k / RATE, noise)))
     with pytest.raises(NotStationaryError, match=message):
         collected.means()
+
+
+@pytest.mark.parametrize("axis", range(12))
+def test_each_limit_of_rest_is_where_it_is_said(axis: int) -> None:
+    """From both sides: of the deviation, of the drift beyond what chance makes, of the mean angular rate."""
+    limits, chance = StationaryLimits(), 5.0
+    still, signs = np.tile((*[0.0] * 8, 9.8, *[0.0] * 3), (800, 1)), np.resize((1.0, -1.0), 800)
+    for share in (0.99, 1.01):
+        noise, turned, drifted = still.copy(), still.copy(), still.copy()
+        noise[:, axis] += share * limits.deviations[axis] * math.sqrt(799 / 800) * signs
+        turned[:, 9:] = share * limits.angular_rate * np.roll((0.6, -0.8, 0.0), axis)
+        windows = [noise, turned]
+        if axis < 9:
+            deviation = limits.deviations[axis] / 4
+            drifted[:, axis] += deviation * math.sqrt(199 / 200) * signs
+            drifted[600:, axis] += share * (limits.drifts[axis] + chance * deviation / math.sqrt(200))
+            windows.append(drifted)
+        for rows in windows:
+            with contextlib.nullcontext() if share < 1 else pytest.raises(NotStationaryError):
+                stationary_means(rows, limits)
 
 
 @pytest.mark.parametrize(

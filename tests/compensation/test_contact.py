@@ -119,6 +119,27 @@ def test_the_point_is_where_the_force_is(place: str) -> None:
     assert np.linalg.eigvalsh(covariance)[[0, 2]] * CHI_2 == pytest.approx([0.0, where.region.largest**2])
 
 
+@pytest.mark.parametrize("motion_n", [0.0, 0.3])
+@pytest.mark.parametrize("axis", range(3))
+def test_contact_ends_within_what_95_percent_of_its_errors_keep_to(axis: int, motion_n: float) -> None:
+    """Of noise, weight or motion at a center of gravity on an axis, and inertia that is not known."""
+    draw, center = np.random.default_rng([SEED, 93, axis]), triple(0.06 * np.eye(3)[axis])
+    known = Uncertainty(0.1, (0.006, 0.008, 0.002), 0.15, center, 1e-4, motion_n)
+    contact, turning, beyond, count = (
+        ContactDetector(FACE, known, RATE_HZ),
+        ((3.0, -4.0, 5.0), (20.0, 30.0, -40.0)),
+        0,
+        8000,
+    )
+    spun = 1e-4 * math.hypot(20.0, 30.0, 40.0, 3.0**2 + 4.0**2 + 5.0**2)
+    for _ in range(count):
+        weight = max(0.15, motion_n) * draw.normal(size=3)
+        moment = np.cross(center, weight) + np.hypot(known.torque, spun) * draw.normal(size=3)
+        contact.is_contact = True
+        beyond += contact.update(triple(0.1 * draw.normal(size=3) + weight), triple(moment), turning)
+    assert beyond / count == pytest.approx(0.05, abs=0.01)
+
+
 PULL = pushed((0.02, 0.01, 0.02), (0.5, -1.0, 10.0))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from bota_ethercat.sensor.response import acceleration_response, force_lag_s, force_torque_response
 from bota_ft_compensation.alignment import gyroscope_later_s
-from bota_ft_compensation.identification.delay import Lag, check_held_out, find_lag
+from bota_ft_compensation.identification.delay import Lag, check_held_out, find_lag, lowest
 from bota_ft_compensation.identification.resampling import resampled
 from bota_ft_compensation.quantities import CompensationError, Payload
 from tests.compensation import motion
@@ -144,3 +145,33 @@ def test_a_stretch_that_is_long_enough_is_used() -> None:
     period, parts = resampled(times, times[:, None], 1.0)
     assert period == pytest.approx(0.01)
     assert [(round(grid[0], 2), round(grid[-1], 1)) for grid, _ in parts] == [(2.0, 3.5)]
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_minimum_is_found_near_where_the_search_begins_and_no_maximum(side: float) -> None:
+    assert lowest(lambda x: (x - 0.7 * side) ** 2 + 0.1 * side * x**3, 0.5 * side, 0.1) == pytest.approx(
+        side * (math.sqrt(4 + 4 * 0.3 * 1.4) - 2) / 0.6, abs=1e-4
+    )
+    steps = sum(0.5**n for n in range(6))
+    assert lowest(lambda x: (x - 100.0 * side) ** 2, 0.0, 1.0) == pytest.approx(side * steps)
+    assert lowest(lambda x: -((x - side) ** 2), 0.0, 1.0) == 0.0
+
+
+@pytest.mark.parametrize("feature", range(9))
+def test_a_force_of_one_part_of_the_motion_alone_is_explained(feature: int) -> None:
+    """Specific force, or a product of rates, as they come."""
+    draw = np.random.default_rng([SEED, 8]).normal(size=(8000, 6))
+    imu = np.stack([np.convolve(column, np.hanning(80) / 10, "same") for column in draw.T], axis=1)
+    acceleration, (x, y, z) = imu[:, :3], imu[:, 3:].T
+    part = [*acceleration.T, x * x, x * y, x * z, y * y, y * z, z * z][feature]
+    samples = np.concatenate([part[:, np.newaxis] * [1.0, -2.0, 3.0], imu], axis=1)
+    with pytest.raises(CompensationError, match=r"leaves .* N in .* and (0\.00\d+|\d\.?\d*e-\d+) N without"):
+        check_held_out(np.arange(8000) / 800.0, samples, {}, Lag(0.01, 1e-4, 1.0))
+
+
+def test_a_lag_that_changes_has_a_wide_interval() -> None:
+    """As of a cable that pulls: by 2 ms to and fro, from part to part."""
+    felt = motion.filtered(shaken(1), TOOL, 10.0, settings(), seed=1)
+    shifted = felt.times - 0.002 * np.sin(0.2 * np.pi * felt.times)
+    force = np.stack([np.interp(shifted, felt.times, axis) for axis in felt.force.T], axis=1)
+    assert 0.8e-3 < lag_of(felt._replace(force=force)).interval_s < 2e-3

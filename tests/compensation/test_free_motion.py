@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -9,10 +10,10 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ft_compensation.alignment import align
-from bota_ft_compensation.identification.free_motion import identify_in_motion
+from bota_ft_compensation.identification.free_motion import _check_free, identify_in_motion
 from bota_ft_compensation.identification.inertia import Turned, identify_inertia, turn
 from bota_ft_compensation.identification.payload import Identified
-from bota_ft_compensation.quantities import EXACT, Accelerometer, CompensationError
+from bota_ft_compensation.quantities import EXACT, OFFSET_PRIOR, SCALE_PRIOR, Accelerometer, CompensationError
 from tests.compensation import motion
 from tests.compensation.making import BIAS, SEED, check_coverage
 from tests.compensation.motion import IMU, Felt, imperfect, settings
@@ -70,8 +71,8 @@ def held(felt: Felt, newtons: float = 2.0, at: Sequence[float] = (0.02, 0.1, 0.1
     )
 
 
-def part_of_the_time(felt: Felt, share: float) -> Felt:
-    return pushed(felt, (felt.times[:, None] % 4.0 < 4.0 * share) * np.array([4.0, -2.0, 1.0]))
+def part_of_the_time(felt: Felt, share: float, times: float = 1.0) -> Felt:
+    return pushed(felt, (felt.times[:, None] % 4.0 < 4.0 * share) * times * np.array([4.0, -2.0, 1.0]))
 
 
 FREE = "not those of a tool that moves freely"
@@ -120,6 +121,14 @@ def test_a_touch_is_left_out_and_hardly_any_motion_is_refused() -> None:
     assert "hardly turned about y and z" in found.notes[0]
 
 
+@pytest.mark.parametrize("times", [1.0, 12.0])
+def test_a_touch_of_any_force_is_left_out(times: float) -> None:
+    tool = tool_of(SEED + 6)
+    found = identified(part_of_the_time(recorded("turned", SEED + 6, tool), 0.3, times))
+    assert found.payload.mass == pytest.approx(tool.mass, abs=found.mass_interval)
+    assert found.mass_interval < 0.01
+
+
 def test_the_center_of_a_heavy_tool_is_known_better() -> None:
     """Its interval is that of the moment by the mass."""
     light, heavy = (
@@ -146,3 +155,22 @@ def test_what_is_made_of_a_sample_does_not_depend_on_where_the_recording_begins(
     assert same.sum() > 100
     assert part.felt[same] == pytest.approx(whole.felt[rows][same], abs=1e-6)
     assert part.spun[same] == pytest.approx(whole.spun[rows][same], abs=1e-6)
+
+
+@pytest.mark.parametrize("arm", [0.01, 0.2])
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_how_much_may_be_left_of_free_motion(share: float, arm: float) -> None:
+    """From both sides of each limit: rms force and torque, time left out, what no accelerometer has."""
+    weight, answer = 2.0 * STANDARD_GRAVITY, np.zeros(34)
+    answer[0], answer[1:4] = 2.0, 2.0 * arm * np.array((0.6, 0.0, -0.8))
+    force, torque = 0.1 + 0.01 * weight, 0.1 * 0.05 + 0.01 * weight * max(arm, 0.05)
+    rows, priors = np.zeros((2, 6)), [OFFSET_PRIOR] * 3 + [SCALE_PRIOR] * 9
+    beyond = [answer + (-1) ** n * share * 5.0 * prior * np.eye(34)[22 + n] for n, prior in enumerate(priors)]
+    for each, left, kept in (
+        (answer, rows + share * force * np.array([0.8, 0.0, 0.6, 0.0, 0.0, 0.0]), 1.0),
+        (answer, rows + share * torque * np.array([0.0, 0.0, 0.0, 0.8, 0.6, 0.0]), 1.0),
+        (answer, rows, 0.6 / share),
+        *((each, rows, 1.0) for each in beyond),
+    ):
+        with contextlib.nullcontext() if share < 1 else pytest.raises(CompensationError, match=FREE):
+            _check_free(each, 0.1, left, kept)

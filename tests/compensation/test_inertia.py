@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import random
@@ -12,13 +13,23 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ft_compensation.alignment import align
+from bota_ft_compensation.bias import TareBasis
 from bota_ft_compensation.bounds import (
     IMU_BELOW,
+    force_bound_95,
     inertia_noise,
     torque_bound_95,
     torque_noise_95,
 )
-from bota_ft_compensation.identification.inertia import identify_inertia, turn
+from bota_ft_compensation.identification.inertia import (
+    Turned,
+    divided,
+    identify_inertia,
+    possible_inertia,
+    solve_pieces,
+    turn,
+    untouched,
+)
 from bota_ft_compensation.identification.payload import Identified, identify
 from bota_ft_compensation.quantities import (
     EXACT,
@@ -69,9 +80,14 @@ def recorded(name: str, seed: int, tool: Payload, seconds: float = 20.0, **chose
     )
 
 
-def identified(felt: Felt, tool: Payload, known: Accelerometer = EXACT, **chosen: Any) -> Identified:
+def identified(
+    felt: Felt, tool: Payload, known: Accelerometer = EXACT, off_m: float = 0.0, **chosen: Any
+) -> Identified:
+    """By poses that have the center of gravity wrong by `off_m`, each way."""
     noise = random.Random(int(1e6 * tool.mass))
-    poses = identify([pose(up, tool, BIAS, noise, 0.01) for up in AXES])
+    poses = identify([pose(up, tool, BIAS, noise, 0.0005 if off_m else 0.01) for up in AXES])
+    x, y, z = poses.payload.center
+    poses = poses._replace(payload=poses.payload._replace(center=(x + off_m, y - off_m, z + off_m)))
     alignment = align(settings(**chosen), RATE_HZ)
     return identify_inertia(turn(felt.times, np.hstack(felt[1:]), alignment, known, IMU), poses)
 
@@ -180,6 +196,12 @@ def test_where_it_hardly_turns_only_what_mass_and_center_make_likely_is_known() 
     assert about_x.payload.inertia_interval[0] < 0.05 * half[0]
 
 
+def test_in_motion_the_center_of_gravity_is_not_quite_that_of_the_poses() -> None:
+    tool = tool_of(6)
+    found = identified(recorded("turned", 6, tool), tool, imperfect(6).known, 2e-4).payload
+    assert np.all(np.abs(np.subtract(found.inertia, tool.inertia)) < found.inertia_interval)
+
+
 def test_samples_with_contact_are_left_out_and_what_no_body_has_is_refused() -> None:
     tool, known = tool_of(6), imperfect(6).known
     felt = recorded("turned", 6, tool)
@@ -200,3 +222,121 @@ def test_samples_with_contact_are_left_out_and_what_no_body_has_is_refused() -> 
     assert identified(Felt(*(part[lost] for part in felt)), tool, known).payload.inertia == pytest.approx(
         tool.inertia, abs=5e-4
     )
+
+
+# -- step by step, of exact data
+
+
+def turned_of(times: Array, spun: Array | float = 0.0) -> Turned:
+    count = len(times)
+    nothing = np.zeros((count, 3))
+    return Turned(nothing, nothing, nothing, np.zeros((count, 3, 3)), np.zeros((count, 3, 6)) + spun, times)
+
+
+def test_the_variance_of_pieces_is_that_of_the_answers() -> None:
+    """Of residuals that are correlated, with what is known before, and of what nothing shows."""
+    draw, truth = np.random.default_rng([SEED, 31]), np.array((2.0, -1.0, 0.5, 3.0))
+    pieces, known = np.repeat(3 * np.arange(60), 5), np.array((0.0, 0.0, 1600.0, 0.04))
+    squares = []
+    for _ in range(400):
+        design = draw.normal(size=(180, 3, 4))[pieces] + 0.3 * draw.normal(size=(300, 3, 4))
+        design[..., 3] = 0.0
+        noise = draw.normal(size=(180, 3))[pieces] + 0.3 * draw.normal(size=(300, 3))
+        expected = truth + np.array((0.0, 0.0, 0.025 * draw.normal(), 0.0))
+        measured = design @ truth + noise * (0.05, 0.2, 1.0)
+        found, covariance, degrees = solve_pieces(design, measured, pieces, known, expected)
+        assert degrees == pytest.approx(60 - 4 / 3)
+        assert (found[3], covariance[3, 3]) == pytest.approx((3.0, 25.0))
+        squares.append((found - truth)[:3] ** 2 / np.diag(covariance)[:3])
+    assert np.mean(squares, axis=0) == pytest.approx(np.ones(3), abs=0.25)
+
+
+def test_the_nearest_tensor_of_a_body_within_the_interval() -> None:
+    turn_by = motion.rotations(np.array([[0.3, -0.5, 0.8]]))[0]
+
+    def turned(*moments: float) -> tuple[float, ...]:
+        return tuple(
+            (turn_by @ np.diag(moments) @ turn_by.T)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].tolist()
+        )
+
+    impossible, nearest = turned(0.01, 0.02, 0.035), turned(0.0125, 0.0225, 0.035)
+    for half, given, expected in (
+        (1e-9, turned(0.01, 0.02, 0.025), turned(0.01, 0.02, 0.025)),
+        (0.0026, impossible, nearest),
+        (0.0024, impossible, None),
+    ):
+        interval = half * np.array((0.6, 0.0, 0.0, 0.0, 0.8, 0.0))
+        with (
+            contextlib.nullcontext()
+            if expected
+            else pytest.raises(
+                CompensationError, match=r"moments of inertia would be 0\.01, 0\.02, 0\.035 kg m²"
+            )
+        ):
+            assert possible_inertia(np.array(given), interval) == pytest.approx(expected)
+
+
+def test_a_touch_is_left_out_with_what_is_near_and_hardly_any_turning_is_noise() -> None:
+    times = np.linspace(0.0, 9.9875, 800)
+    beyond = np.zeros(800)
+    beyond[400], beyond[100] = 2.01, 1.99
+    assert np.flatnonzero(~untouched(turned_of(times), beyond, 20.0)).tolist() == [*range(384, 417)]
+    spun = np.array((0.0, 0.29, 0.31, 5.0, 0.0, 0.0)) / math.sqrt(3) * np.ones((3, 1))
+    minutes, pieces, kept = divided(turned_of(times + 7.0, spun))
+    assert pieces.tolist() == np.repeat(np.arange(20), 40).tolist()
+    assert (minutes[0, 0, 0], minutes[-1, 0, 0]) == pytest.approx((-799 / 9600, 799 / 9600))
+    assert kept == pytest.approx(np.broadcast_to(spun * [0, 0, 1, 1, 0, 0], (800, 3, 6)))
+
+
+@pytest.mark.parametrize(
+    ("rate", "acceleration", "refused"),
+    [
+        *((1 / gain, 1.0, abs(gain - 1) > 0.35) for gain in (0.6, 0.68, 1.32, 1.4)),
+        *((1.0, size / STANDARD_GRAVITY, not 7 < size < 13) for size in (6.7, 7.3, 12.7, 13.3)),
+    ],
+)
+def test_from_which_disagreement_on_an_imu_is_refused(
+    rate: float, acceleration: float, refused: bool
+) -> None:
+    """Of a sensor that turns about its IMU, which feels gravity only."""
+
+    def angles(t: Array) -> Array:
+        return np.stack([np.sin(2 * t), 0.5 * np.sin(3 * t), 0.7 * np.cos(2.5 * t)], axis=1)
+
+    felt = motion.feel(lambda t: (np.zeros((len(t), 3)), angles(t)), tool_of(1), 6.0, imu=motion.PERFECT)
+    rotation = motion.rotations(angles(felt.times))
+    gravity = STANDARD_GRAVITY * acceleration * rotation[:, 2]
+    samples = np.hstack([felt.force, felt.torque, gravity, rate * felt.rate])
+    with pytest.raises(CompensationError) if refused else contextlib.nullcontext():
+        turn(felt.times, samples, align(settings(), RATE_HZ), EXACT, (0.0, 0.0, 0.0))
+
+
+def test_each_part_of_the_bounds_alone() -> None:
+    tool, typical = Payload(2.0, (0.03, 0.0, -0.04), (0.0,) * 6, (1e-12,) * 3, (1e-12,) * 6), 2.80 / 1.96
+    none = EXACT._replace(
+        offset_interval=(0.0,) * 3, scale_interval=(0.0,) * 3, cross_axis_interval=(0.0,) * 6
+    )
+    for name, count, unit in (
+        ("offset_interval", 3, 1.0),
+        ("scale_interval", 3, STANDARD_GRAVITY),
+        ("cross_axis_interval", 6, STANDARD_GRAVITY),
+    ):
+        for axis in range(count):
+            known = none._replace(**{name: tuple(0.01 * np.eye(count)[axis])})
+            assert force_bound_95(tool, known) == pytest.approx(2.0 * typical * 0.01 * unit)
+            assert torque_bound_95(tool, known) == pytest.approx(2.0 * typical * 0.01 * unit * 0.05)
+            taken = TareBasis(tool, (1.0, 0.0, 0.0), known)
+            tared = 4.39 / 1.96 * 0.01 * unit * (name != "offset_interval")
+            assert force_bound_95(tool, known, taken) == pytest.approx(2.0 * tared)
+            assert force_bound_95(tool, known, TareBasis(tool, (1.0, 0.0, 0.0), none)) > 1.9 * typical * 0.01
+    vector, felt, still = (3.0, -4.0, 12.0), (2.0, 1.0, -2.0), (0.0, 0.0, 0.0)
+    for element, (i, j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
+        one = tool._replace(inertia_interval=tuple(0.01 * np.eye(6)[element]))
+        expected = 0.01 * (math.hypot(vector[i], vector[j]) if i != j else abs(vector[i]))
+        assert torque_bound_95(one, none, turning=(still, vector)) == pytest.approx(expected)
+        assert torque_bound_95(one, none, turning=(vector, still)) == pytest.approx(0.5 * 13.0 * expected)
+    vague = tool._replace(center_interval=(0.001, 0.003, 0.002))
+    assert torque_bound_95(vague, none, felt=felt) == pytest.approx(2.0 * typical * 0.003 * 3.0)
+    taken = TareBasis(tool, (1.0, 0.0, 0.0), none)
+    assert torque_bound_95(vague, none, taken, felt) == pytest.approx(2.0 * 4.39 / 1.96 * 0.003 * 3.0)
+    assert torque_bound_95(tool, none, noise=0.02) == pytest.approx(0.02)

@@ -324,33 +324,46 @@ def test_which_orientation_counts_and_for_how_long() -> None:
 # Orientations that are older or newer than the sample.
 
 
+AXIS = (0.6, -0.48, 0.64)
+
+
 def arm(turned: float) -> tuple[float, float, float, float]:
-    """The orientation of a sensor that has turned about its x axis by so much."""
-    return quaternion_about((1.0, 0.0, 0.0), turned)
+    """The orientation of a sensor that has turned about an axis between its own by so much."""
+    return quaternion_about(AXIS, turned)
+
+
+def spun(rate: float) -> Vector3:
+    x, y, z = (rate * part for part in AXIS)
+    return x, y, z
 
 
 @pytest.mark.parametrize("told_s", [1.0, 1.003, 1.0199, 1.024])
 @pytest.mark.parametrize("late", [False, True])
 def test_an_orientation_between_two_samples_is_turned_on_by_what_is_left(told_s: float, late: bool) -> None:
-    source, rate = QuaternionGravity(), 2.0
+    source = QuaternionGravity()
+
+    def at(time_s: float) -> tuple[float, float, float, float]:
+        """Faster and faster, from 2 rad/s on."""
+        return arm(2.0 * time_s + 0.05 * (time_s - 1.0) ** 2)
+
     for number in range(4):
         if number == 2 + late:
-            source.update(arm(rate * told_s), told_s)
+            source.update(at(told_s), told_s)
         if number < 3 or told_s < 1.02:
-            source.add_rate((rate, 0.0, 0.0), 1.0 + 0.01 * number)
+            source.add_rate(spun(2.0 + 0.001 * number), 1.0 + 0.01 * number)
     expected = QuaternionGravity()
-    expected.update(arm(rate * (1.03 if told_s < 1.02 else 1.02)), told_s)
+    expected.update(at(1.03 if told_s < 1.02 else 1.02), told_s)
     assert source.gravity(told_s) == pytest.approx(expected.gravity(told_s), abs=1e-4)
 
 
 def test_an_orientation_is_turned_on_from_the_first_two_rates_on() -> None:
     source = QuaternionGravity()
     assert source.update((0.0, 0.0, 0.0, 1.0), 0.0)
-    source.add_rate((2.0, 0.0, 0.0), 0.0)
-    source.add_rate((2.0, 0.0, 0.0), 0.01)
-    assert source.gravity(0.01) == pytest.approx(
-        (0.0, STANDARD_GRAVITY * -math.sin(0.02), -STANDARD_GRAVITY * math.cos(0.02)), abs=1e-4
-    )
+    source.add_rate(spun(2.0), 0.0)
+    source.add_rate(spun(2.0), 0.01)
+    expected = QuaternionGravity()
+    expected.update(arm(0.02), 0.0)
+    assert source.gravity(0.01) == pytest.approx(expected.gravity(0.0), abs=1e-4)
 
 
 def test_an_orientation_is_held_where_the_gyroscope_is_of_no_use() -> None:

@@ -170,3 +170,18 @@ def test_there_and_back_is_where_it_was(transform: WrenchTransform, force: Vecto
 def test_what_is_no_pose(translation: Vector3, quaternion: Quaternion) -> None:
     with pytest.raises(ValueError, match=r"a rotation is a quaternion of length 1|three finite numbers"):
         WrenchTransform.of(translation, quaternion)
+
+
+@pytest.mark.parametrize(
+    ("cutoff_hz", "kept_ns", "forgotten_ns"),
+    [(100.0, 4_370_000, 4_380_000), (1.0, 159_000_000, 159_300_000), (100.0, 0, -1)],
+)
+def test_after_which_pause_the_low_pass_begins_anew(
+    cutoff_hz: float, kept_ns: int, forgotten_ns: int
+) -> None:
+    """3.5 sample periods, or its memory where that is longer; or a clock that was set back."""
+    for passed_ns, is_anew in ((kept_ns, False), (forgotten_ns, True)):
+        made = designed(cutoff_hz, 800.0)
+        made.step((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10**9)
+        found = made.step((8.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10**9 + passed_ns)
+        assert (found.force[0] == pytest.approx(8.0)) is is_anew

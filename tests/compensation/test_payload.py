@@ -409,6 +409,9 @@ def test_a_pose_that_is_none_and_gravity_of_another_source() -> None:
     with pytest.raises(CompensationError, match="without gravity"):
         pose_of(still((0, 0, 1)), (0.0, 0.0, 0.0))
     assert pose_of(still((0, 0, 1)), (0.0, -9.7, 0.0)).gravity == (0.0, -9.7, 0.0)
+    for off in (-1.51, -1.49, 1.49, 1.51):
+        read = still((0, 0, 1))._replace(acceleration=(0.0, 0.0, STANDARD_GRAVITY + off))
+        assert pose_of(read, (0.0, -9.7, 0.0)).acceleration == (read.acceleration if abs(off) < 1.5 else None)
     read = still((0, 0, 1))._replace(acceleration=(0.0, 0.0, 10.0))
     assert pose_of(read).gravity == (0.0, 0.0, -STANDARD_GRAVITY), "only the direction is from it"
 

@@ -133,6 +133,80 @@ def test_tool_and_doctor_take_every_name(veth: Veth) -> None:
         assert "no EtherCAT slave answers" in found.findings("bus")["slaves"]["found"]
 
 
+DROPS = "a bridge, which drops EtherCAT frames because their source address is a group's"
+SEES = nic.Interface("near0", 5)
+OTHERS = {5: SEES, 7: nic.Interface("br0", 7, kind="bridge"), 8: nic.Interface("far0", 8, master_index=7)}
+
+
+@pytest.mark.parametrize(
+    ("found", "why"),
+    [
+        ({}, "check cable and power"),
+        (
+            {"kind": "bridge", "up": False},
+            f"near0 is {DROPS}: name the interface that the sensor is connected to",
+        ),
+        (
+            {"up": False, "master_index": 7},
+            "near0 is down: bring it up with 'sudo ip link set near0 up'",
+        ),
+        (
+            {"master_index": 7, "mtu": 1499},
+            "near0 is part of br0 (a bridge or bond), which takes its frames: remove it with "
+            "'sudo ip link set near0 nomaster', or use another interface",
+        ),
+        (
+            {"mtu": 1499, "carrier": False},
+            "near0 has an MTU of 1499 bytes, too few for EtherCAT: 'sudo ip link set near0 mtu 1500'",
+        ),
+        (
+            {"carrier": False, "xdp": ("xdpdrv",)},
+            "near0 has no carrier: check the cable, the PoE injector and its power supply",
+        ),
+        ({"link": 5, "kind": "veth"}, "check cable and power"),
+        (
+            {"link": 8, "kind": "veth", "xdp": ("xdpdrv",)},
+            f"near0 is connected to br0, {DROPS}: connect the sensor to near0 itself, or "
+            "'sudo ip link set far0 nomaster'",
+        ),
+        (
+            {"link": 7, "kind": "macvlan"},
+            f"near0 is connected to br0, {DROPS}: connect the sensor to near0 itself",
+        ),
+        (
+            {"xdp": ("xdpgeneric", "xdpoffload")},
+            "near0 has an XDP program, which may drop its frames and stays when the program that loaded it "
+            "has ended: 'sudo ip link set dev near0 xdpgeneric off'",
+        ),
+    ],
+)
+def test_what_stops_frames_is_told_by_its_worst_alone(
+    found: dict[str, object], why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = OTHERS | {5: replace(SEES, **found)}  # type: ignore[arg-type]
+    monkeypatch.setattr(nic, "look_up", lambda which: known[which])
+    monkeypatch.setattr(nic, "_look_up", lambda which, _: known[which])
+    monkeypatch.setattr(nic, "_link_mbits", lambda _: 100)
+    assert why_silent(5) == why
+
+
+def test_who_gets_a_copy_of_the_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All sockets for all protocols, on it or on all interfaces; of some the process is not visible."""
+    rows = [(3, 5, 1), (3, 0, 2), (3, 6, 3), (0x88A4, 5, 4), (3, 0, 5), (3, 5, 6), (3, 0, 7)]
+    one, two, none = (
+        nic.Process(pid, "x", sockets) for pid, sockets in ((10, {1, 2, 3}), (11, {2, 4, 5}), (12, {3}))
+    )
+    monkeypatch.setattr(nic, "packet_sockets", lambda: [nic.Listener(*row) for row in rows])
+    monkeypatch.setattr(
+        nic, "users_of", lambda inodes: (each for each in (one, two, none) if each.sockets & inodes)
+    )
+    assert [*nic.receivers(5)] == [(one, True), (two, False), (None, True)]
+    del rows[-2]
+    assert [*nic.receivers(5)][2:] == [(None, False)]
+    rows[:] = rows[2:4]
+    assert [*nic.receivers(5)] == []
+
+
 # -- what is in between
 
 
@@ -448,6 +522,14 @@ def test_a_lock_that_may_be_anothers_is_not_used(veth: Veth, directory: Path, tr
         directory.chmod(trap)
     with claimed(veth.near), pytest.raises(OSError):  # noqa: PT011 - any
         nic._open_lock("lock")
+
+
+def test_a_folder_of_locks_that_others_could_enter_is_closed(veth: Veth, directory: Path) -> None:
+    directory.mkdir()
+    directory.chmod(0o755)
+    with claimed(veth.near):
+        assert directory.stat().st_mode & 0o777 == 0o700
+        assert [lock.stat().st_mode & 0o777 for lock in directory.iterdir()] == [0o755]
 
 
 def test_without_run_it_is_a_name_in_the_namespace(veth: Veth, monkeypatch: pytest.MonkeyPatch) -> None:

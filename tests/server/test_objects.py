@@ -18,7 +18,7 @@ from bota_ethercat.settings import SETTINGS
 from ethercat_server.acquisition.acyclic import Acyclic
 from ethercat_server.acquisition.jobs import Jobs
 from ethercat_server.acquisition.stream import SensorStream
-from ethercat_server.errors import BusError, SdoAbortError
+from ethercat_server.errors import BusError, SdoAbortError, SetUpError
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.datagrams import Steps, T, finish
@@ -118,7 +118,7 @@ class GivenBus:
 
     def __init__(self, *answers: tuple[int, int, bytes]) -> None:
         self.answers = list(answers)
-        self.asked = 0
+        self.asked, self.requests = 0, list[bytes]()
 
     def read_register(self, slave: int, address: int, size: int) -> Steps[bytes]:
         yield from ()
@@ -134,6 +134,7 @@ class GivenBus:
         if data[9:11] == PROBED.to_bytes(2, "little"):
             self.answers.insert(0, (READ, PROBED, bytes(4)))
         self.asked += 1
+        self.requests.append(data)
         return True
 
 
@@ -154,6 +155,79 @@ def test_the_late_answer_to_a_repeated_transfer_is_left_alone() -> None:
     assert run(bus, mailbox(bus).read(0x8001, 1)) == b"abcd"
     bus = GivenBus((READ, 0x8001, b"abcd"), (WRITTEN, 0x8001, bytes(4)))
     run(bus, mailbox(bus).write(0x8001, 1, b"efgh"))
+
+
+@pytest.mark.parametrize(
+    ("command", "answer", "value"),
+    [
+        (0x43, b"abcd", b"abcd"),
+        (0x47, b"abcd", b"abc"),
+        (0x4B, b"abcd", b"ab"),
+        (0x4F, b"abcd", b"a"),
+        (0x42, b"abcd", b"abcd"),
+        (0x41, b"\6\0\0\0abcdef", b"abcdef"),
+        (0x41, b"\3\0\0\0abcdef", b"abc"),
+        (0x41, b"\7\0\0\0abcdef", None),
+    ],
+)
+def test_what_is_read_is_as_long_as_the_answer_says(command: int, answer: bytes, value: bytes | None) -> None:
+    bus = GivenBus((command, 0x8001, answer))
+    if value is not None:
+        assert run(bus, mailbox(bus).read(0x8001, 1)) == value
+        return
+    with pytest.raises(BusError) as error:
+        run(bus, mailbox(bus).read(0x8001, 1))
+    assert str(error.value) == (
+        "sensor 0 did not answer reading object 0x8001:1: its 7 bytes do not fit the mailbox"
+    )
+
+
+@pytest.mark.parametrize(
+    ("size", "command"), [(1, 0x2F), (2, 0x2B), (3, 0x27), (4, 0x23), (5, 0x21), (112, 0x21)]
+)
+def test_what_is_written_says_how_long_it_is(size: int, command: int) -> None:
+    bus, data = GivenBus((WRITTEN, 0x8001, bytes(4))), bytes(range(1, size + 1))
+    run(bus, mailbox(bus).write(0x8001, 1, data))
+    told = data.ljust(4, b"\0") if size <= 4 else struct.pack("<I", size) + data
+    body = struct.pack("<HBHB", 0x2000, command, 0x8001, 1) + told
+    assert bus.requests[1] == (struct.pack("<HHBB", len(body), 0, 0, 0x33) + body).ljust(128, b"\0")
+
+
+class SilentBus(GivenBus):
+    """One that loses what is sent at first, and answers nothing; when it was sent, and with which counter."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.clock = ManualClock()
+        self.sent = list[tuple[int, int]]()
+
+    def write_register(self, slave: int, address: int, data: bytes) -> Steps[bool]:
+        yield from ()
+        self.sent.append((self.clock.monotonic_ns(), data[5] >> 4))
+        return len(self.sent) > 2
+
+
+def test_without_an_answer_it_asks_less_and_less_often_and_gives_up() -> None:
+    bus = SilentBus()
+    with pytest.raises(SetUpError) as error:
+        finish(mailbox(bus).read(0x8001, 1), bus.clock)
+    assert str(error.value) == "sensor 0 did not answer reading object 0x8001:1: no answer"
+    pauses = [(after - before) * 1e-6 for (before, _), (after, _) in itertools.pairwise(bus.sent)]
+    assert pauses == pytest.approx([0, 0, 80, 160, 320, 640, 700], abs=3)
+    assert 2.1 < (bus.clock.monotonic_ns() - bus.sent[0][0]) * 1e-9 < 2.81
+    assert [counter for _, counter in bus.sent] == [2, 2, 2, 3, 4, 5, 6, 7]
+
+
+@pytest.mark.parametrize(("later_s", "asked"), [(0.0, 3), (0.09, 3), (0.11, 4)])
+def test_the_mailbox_is_in_step_for_a_while(later_s: float, asked: int) -> None:
+    bus = GivenBus((READ, 0x8001, b"abcd"))
+    bus.clock, sdo = ManualClock(), mailbox(bus)
+    sdo.clock = bus.clock
+    assert finish(sdo.read(0x8001, 1), bus.clock) == b"abcd"
+    bus.clock.sleep(later_s)
+    bus.answers.append((READ, 0x8001, b"efgh"))
+    assert finish(sdo.read(0x8001, 1), bus.clock) == b"efgh"
+    assert bus.asked == asked
 
 
 class CountingSlave:

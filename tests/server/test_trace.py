@@ -9,12 +9,13 @@ import random
 import struct
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from ethercat_server.daemon.traces import Traces
 from ethercat_server.doctor.cli import main as doctor
-from ethercat_server.doctor.trace import find_losses
+from ethercat_server.doctor.trace import find_losses, show
 from ethercat_server.sampling.replay import Decision, Record, Trace, TraceError
 from ethercat_server.sampling.trace import RECORD, RecordKind
 from ethercat_server.simulation.machine import Machine
@@ -170,6 +171,10 @@ def test_what_a_held_up_exchange_cost_is_not_blamed_on_the_sensor() -> None:
     ("asleep_ms", "took_ms", "expected"),
     [
         (1.0, 2.5, ("card or slave", "2 lost: an exchange took 2.50 ms")),
+        (1.0, 0.62, ("card or slave", "2 lost: an exchange took 0.62 ms")),
+        (1.0, 0.58, ("sensor", "2 lost: it was polled and gave none")),
+        (1.48, 0.1, ("sensor", "2 lost: it was polled and gave none")),
+        (1.52, 0.1, ("machine", "2 lost: this computer sent nothing for 1.52 ms")),
         (1.3, 0.1, ("sensor", "2 lost: it was polled and gave none")),
         (1.4, 2.5, ("card or slave", "2 lost: an exchange took 2.50 ms")),
         (2.5, 0.1, ("machine", "2 lost: this computer sent nothing for 2.50 ms")),
@@ -202,6 +207,62 @@ def test_a_sensor_that_takes_no_part_is_told_once() -> None:
         ("not in the exchange", "it took no part in an exchange (working counter 3)"),
         ("not in the exchange", "4 lost: while it took no part"),
     ]
+
+
+def test_what_was_uncertain_is_told_where_it_is_counted() -> None:
+    """Once, with the reason of the sample at which it came up; the first has nothing before it."""
+
+    def found(*told: tuple[int, bool]) -> list[tuple[str, str]]:
+        steps = list[Decision]()
+        for number in range(20):
+            count, uncertain = dict(enumerate(told, 8)).get(number, (1, number == 0))
+            took_ns = 2_000_000 if number == 8 and uncertain else 100_000
+            record = Record(10**9 + number * 10**6, took_ns, 0, 0, 0, RecordKind.FRESH, False, 3)
+            steps.append(Decision(record, record.sent_ns, count, uncertain, True, False))
+        return [loss[2:] for loss in find_losses(0, steps)]
+
+    held = "an exchange took 2.00 ms"
+    assert found((1, True)) == [("uncertain", f"maybe one lost: {held}")]
+    assert found((1, True), (2, False)) == [
+        ("uncertain", f"maybe one lost: {held}"),
+        ("card or slave", f"1 lost: {held}"),
+    ]
+    assert found((1, True), (1, True), (1, False)) == [("uncertain", f"maybe one lost: {held}")]
+    assert found((0, False)) == [("uncertain", "a sample that was counted as lost came late")]
+
+
+def test_a_trace_is_shown_line_by_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a pause of 20 s in it."""
+    steps = list[Decision]()
+    for number in range(1200):
+        kind = RecordKind.READ if number in (5, 6, 7) else RecordKind.FRESH
+        kind = RecordKind.INVALID if number in (150, 151) else kind
+        lost = 3 if number in (152, *range(405, 1005, 30)) else 1
+        at = 10**9 + number * 10**7 + 20_000_000_000 * (number >= 600)
+        record = Record(at, 100_000 + 100 * (number % 100), 0, 0, 0, kind, number % 2 > 0, 3)
+        steps.append(Decision(record, at - 50_000, lost, number == 0, number < 900, number % 2 > 0))
+    made = SimpleNamespace(about={"program": "x 1", "sensors": [{"model": "M8"}]}, records=[*steps])
+    made.replay = lambda: iter(steps)
+    monkeypatch.setattr("ethercat_server.doctor.trace.Trace", lambda _: made)
+    (path := tmp_path / "a.trace").write_bytes(b"")
+    lines = [*show(path)]
+    assert lines[:14] == [
+        "written by x 1, 1200 records",
+        "\nsensor 0 (M8)",
+        "  32.0 s: 1195 samples, 42 lost, 3 polls without a new sample, 2 invalid exchanges",
+        "  age when it was here p50 155, p99 160, max 160 µs",
+        "  followed 74 % of the time, dated by the slave controller 49 %",
+        "  exchanges p50 105, p99 110, max 110 µs",
+        f"      0 s {'.' * 15}i{'.' * 24}{'s..' * 6}s{'.' * 41}",
+        f"     20 s {'.' * 61}{'s..' * 13}",
+        f"     30 s {'.' * 20}",
+        "  ? uncertain, s sensor, c card or slave, m machine, i not in the exchange",
+        "   1.5000 s  sensor 0: it took no part in an exchange (working counter 3)",
+        "   1.5200 s  sensor 0: 2 lost: while it took no part",
+        "   4.0500 s  sensor 0: 2 lost: it was polled and gave none",
+        "   4.3500 s  sensor 0: 2 lost: it was polled and gave none",
+    ]
+    assert (len(lines), lines[-1]) == (31, "(2 more)")
 
 
 def test_who_may_not_control_the_server_gets_no_trace() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,6 +29,31 @@ def chain() -> Iterator[SimulatedBus]:
     models = "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8"
     with simulated_bus("--pdo", "77", "--model", models, "--serial", "10,20", "--sinc", "512") as bus:
         yield bus
+
+
+@pytest.mark.parametrize(
+    ("arguments", "head"),
+    [
+        (("adapters",), "adapter  state  address  use"),
+        (("find",), "interface  found"),
+        (("eeprom", "NEAR"), "word  bytes"),
+        (("objects", "NEAR"), "object  name  value  access  meaning"),
+        (("read", "NEAR", "fir"), "object  name  value  access  meaning"),
+        (("apply", "NEAR", "--set", "fir=true", "--dry-run"), "setting  now  then  meaning"),
+        (("tare", "NEAR", "--clear"), "axis  old offset  new offset  unit"),
+        (
+            ("filters", "--loop", "500"),
+            "SINC  FIR  rate  cut-off  noise  limit  delay  5  10  20  50  margin",
+        ),
+    ],
+)
+def test_each_table_has_a_head_of_all_its_columns(
+    arguments: tuple[str, ...], head: str, bench: SimulatedBus
+) -> None:
+    given = [bench.near if each == "NEAR" else each for each in arguments]
+    given += ["--sensor", "0"] if "tare" in given else []
+    shown = tool_here(*given, code=None).out.splitlines()
+    assert head in [re.sub(" {2,}", "  ", line.strip()) for line in shown]
 
 
 def test_eeprom_shows_the_words_and_what_they_mean(bench: SimulatedBus) -> None:

@@ -27,6 +27,8 @@ STEP_S: Final = 0.001
 READY: Final = (0.0, 20.0, 100.0, 0.0, -30.0, 0.0)  # degrees: the tool before the wall, level
 _SHOWN_EVERY: Final = 20  # steps
 _LARGEST_LAG_S: Final = 0.05  # behind which no step is made up for
+_TEMPERATURE: Final = 5.0  # °C, sent: no running sensor's own, which tells it from others
+_MOST_OTHERS: Final = 500  # readings of another temperature in a row
 
 
 class Arm:
@@ -113,11 +115,19 @@ def perform(task: Identification | Touch, arm: Arm, options: argparse.Namespace)
         while not Path(options.world).is_socket():
             time.sleep(0.1)
     with World(options.world) as world, Client(options.port) as sensor, arm.shown() as window:
-        condition, due = None, time.monotonic()
+        condition, others, due = None, 0, time.monotonic()
         for number in itertools.count():
             felt = arm.step()
-            world.send(due, felt.wrench, felt.acceleration, felt.angular_rate)
+            world.send(due, felt.wrench, felt.acceleration, felt.angular_rate, _TEMPERATURE)
             reading = sensor.latest()
+            if reading.fresh and reading.sample is not None:
+                others = others + 1 if abs(reading.sample.temperature - _TEMPERATURE) > 1.0 else 0
+            if others > _MOST_OTHERS:
+                raise SystemExit(
+                    f"the sensor at port {options.port} does not measure what is sent to {options.world}: "
+                    f'start ethercat-server virtual {options.port} --virtual "--world {options.world}", or '
+                    "give the --port of the server of that virtual sensor"
+                )
             task.update(reading, number * STEP_S)
             if task.done:
                 return
