@@ -15,9 +15,11 @@ import zstandard
 
 from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
-from bota_clients.recording.columns import at_last_offset, columns
+from bota_clients.recording.columns import columns, joined
+from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
 from bota_clients.recording.mcap_file import MAX_CHUNK, McapFile
-from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
+from bota_clients.recording.order import AtLastOffset
+from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import ImuUnits, SampleDecoder
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, write
@@ -107,7 +109,8 @@ def test_columns_are_what_the_decoder_gives(path: Path) -> None:
     ]
     record(path, made)
     with open_recording(path) as recording:
-        table = columns(recording.frames())
+        table = recording.columns(0)
+        assert str(table) == str(columns(recording.frames()))
     for row, item in enumerate(made):
         sample = SampleDecoder(len(item.process_data)).decode(item.process_data)
         for name in ("force", "torque", "acceleration", "angular_rate"):
@@ -123,7 +126,7 @@ def test_columns_are_what_the_decoder_gives(path: Path) -> None:
 
     record(path, [])
     with open_recording(path) as recording:
-        table = columns(recording.frames())
+        table = recording.columns(0)
     assert (len(table), table.force.shape, table.orientation.shape) == (0, (0, 3), (0, 4))
 
 
@@ -295,7 +298,8 @@ def test_only_what_is_around_a_change_of_the_sensors_own_offset_is_left_out(tmp_
     """0.1 s before it was told and two samples after, none where it is told again."""
     path = tared(tmp_path / "run.mcap", (1.0, 1.0, 2.0, 4.0), (5.0, 5.0, 6.0, 8.0))
     with open_recording(path) as recording:
-        found, offset, remarks = at_last_offset(recording, recording.sensors[0], ImuUnits.SI)
-    assert (offset, remarks) == ((4.0, 0, 0, 0, 0, 0), [])
+        read = AtLastOffset(recording, recording.sensors[0], ImuUnits.SI)
+        found = joined([*read])
+    assert (read.offset, read.said) == ((4.0, 0, 0, 0, 0, 0), [])
     assert found.force[:, 0] == pytest.approx(8.0)
     assert sorted({*range(3200)} - {*found.sequence.tolist()}) == [*range(1520, 1603), *range(2320, 2403)]

@@ -22,7 +22,8 @@ from bota_clients.identify.stationary_periods import (
 )
 from bota_clients.identify.tool_file import write_bota
 from bota_clients.program import say
-from bota_clients.recording.columns import Columns, at_last_offset
+from bota_clients.recording.columns import Columns, joined
+from bota_clients.recording.order import AtLastOffset
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.program.new_file import refuse_existing
@@ -158,8 +159,9 @@ def run(options: argparse.Namespace) -> int:
         for row in sensor.history:
             if why := obstacle(row.info.settings, has_tool=True, by_imu=True):
                 raise RecordingError(f"{options.path} does not show a tool: {why}; and record again")
-        data, offset, remarks = at_last_offset(recording, sensor, options.imu_units)
-    for remark in remarks:
+        read = AtLastOffset(recording, sensor, options.imu_units)
+        data, offset = joined([*read]), read.offset
+    for remark in read.said:
         _say(f"{options.path}: {remark}")
     periods, rejected = find_stationary_periods(data)
     if len(periods) > MOST_POSES:
