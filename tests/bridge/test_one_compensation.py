@@ -20,7 +20,8 @@ from bota_clients.export.cli import main as export
 from bota_clients.identify.cli import main as identify
 from bota_clients.record.recorder import Recorder, RecordingClient
 from bota_clients.recording.columns import columns
-from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
+from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
+from bota_clients.recording.reader import open_recording
 from bota_clients.report.cli import main as report
 from bota_ethercat.address import Address
 from bota_ethercat.framing import DataMessage, encode_data

@@ -119,7 +119,7 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
     path = tmp_path / "run.mcap"
     record(path, [frame(0)])
-    monkeypatch.setattr(Recording, "frames", interrupted)
+    monkeypatch.setattr(Recording, "tables", interrupted)
     assert export(path, code=1).err == "ethercat-export: stopped: nothing was written\n"
     assert list(tmp_path.iterdir()) == [path]
 

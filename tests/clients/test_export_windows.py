@@ -22,6 +22,7 @@ from bota_clients.errors import RecordingError
 from bota_clients.export.cli import main, parse_options
 from bota_clients.export.dataset import Periodic, Stamped, messages, read_stamps, windows_of
 from bota_clients.export.windows import Array, Arrays, Windows
+from bota_clients.recording.columns import columns
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.replies import SensorInfo
@@ -127,7 +128,7 @@ def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> N
     sent, asked, blocks = [each for each in frames if not each.flags & DataFlag.REPEATED], 0, []
     while sent:
         size = chance.randrange(1, 40)
-        live.add(sent[:size])
+        live.add(columns(sent[:size]))
         sent = sent[size:]
         instants = recorded["monotonic_ns"][asked:]
         ready = instants[: np.searchsorted(instants, live.until_ns, "right")]
@@ -162,7 +163,7 @@ def test_what_is_forgotten_is_in_no_window_of_that_instant(slow: str) -> None:
     made, at = Windows(8), np.array([70 * PERIOD_NS])
     chosen = SETTINGS | ({slow: 6} if slow else {"fir": True})
     made.configure(InForce(SensorInfo(settings=chosen, rate_hz=RATE_HZ)))
-    made.add([frame(number) for number in range(120)])
+    made.add(columns([frame(number) for number in range(120)]))
     before = made.at(at)
     made.forget(int(at[0]))
     for name, array in made.at(at).items():
@@ -195,9 +196,8 @@ def test_a_changed_offset_puts_the_samples_before_in_doubt_whatever_the_filters_
     for begin, offset in ((0, 1.0), (100, 2.0)):
         info = SensorInfo(rate_hz=100.0, settings=settings, offset=(offset, 0, 0, 0, 0, 0))
         live.configure(InForce(info))
-        live.add(
-            [frame(number)._replace(monotonic_ns=number * 10_000_000) for number in range(begin, begin + 100)]
-        )
+        frames = (frame(number) for number in range(begin, begin + 100))
+        live.add(columns(each._replace(monotonic_ns=each.sequence * 10_000_000) for each in frames))
     valid = live.at(np.array([live.until_ns]))["force_torque_compensated_valid"][0]
     samples = np.arange(len(valid)) + 200 - len(valid)
     doubted = samples[(~valid) & (samples < 190)]

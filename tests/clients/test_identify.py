@@ -17,7 +17,6 @@ import pytest
 
 from bota_clients.identify.cli import main
 from bota_clients.identify.stationary_periods import StationaryPeriod, find_stationary_periods
-from bota_clients.recording.columns import columns
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
@@ -94,7 +93,7 @@ def refused(*arguments: object) -> str:
 
 def periods(path: Path, least_seconds: float = 1.0) -> list[StationaryPeriod]:
     with open_recording(path) as opened:
-        found, rejected = find_stationary_periods(columns(opened.frames()), least_seconds)
+        found, rejected = find_stationary_periods([opened.columns(0)], least_seconds)
     assert rejected == []
     return found
 

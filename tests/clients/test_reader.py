@@ -15,9 +15,11 @@ import zstandard
 
 from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
-from bota_clients.recording.columns import at_last_offset, columns
+from bota_clients.recording.columns import columns, joined
+from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
 from bota_clients.recording.mcap_file import MAX_CHUNK, McapFile
-from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
+from bota_clients.recording.order import AtLastOffset
+from bota_clients.recording.reader import open_recording
 from bota_clients.report.series import of_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import ImuUnits, SampleDecoder
@@ -108,7 +110,8 @@ def test_columns_are_what_the_decoder_gives(path: Path) -> None:
     ]
     record(path, made)
     with open_recording(path) as recording:
-        table = columns(recording.frames())
+        table = recording.columns(0)
+        assert str(table) == str(columns(recording.frames()))
     for row, item in enumerate(made):
         sample = SampleDecoder(len(item.process_data)).decode(item.process_data)
         for name in ("force", "torque", "acceleration", "angular_rate"):
@@ -124,7 +127,7 @@ def test_columns_are_what_the_decoder_gives(path: Path) -> None:
 
     record(path, [])
     with open_recording(path) as recording:
-        table = columns(recording.frames())
+        table = recording.columns(0)
     assert (len(table), table.force.shape, table.orientation.shape) == (0, (0, 3), (0, 4))
 
 
@@ -296,11 +299,10 @@ def test_only_what_is_around_a_change_of_the_sensors_own_offset_is_left_out(tmp_
     """0.1 s before it was told and two samples after, none where it is told again; announced: not before."""
     path = tared(tmp_path / "run.mcap", (1.0, 1.0, 2.0, None, 4.0), (5.0, 5.0, 6.0, 7.3, 8.0))
     with open_recording(path) as recording:
-        found, offset, remarks = at_last_offset(recording, recording.sensors[0], ImuUnits.SI)
-    assert (offset, remarks) == (
-        (4.0, 0, 0, 0, 0, 0),
-        ["800 frames left out: the sensor's own offset was not known"],
-    )
+        read = AtLastOffset(recording, recording.sensors[0], ImuUnits.SI)
+        found = joined([*read])
+    remarks = ["800 frames left out: the sensor's own offset was not known"]
+    assert (read.offset, read.said) == ((4.0, 0, 0, 0, 0, 0), remarks)
     assert found.force[:, 0] == pytest.approx(8.0)
     assert sorted({*range(4000)} - {*found.sequence.tolist()}) == [*range(1520, 1603), *range(2400, 3203)]
     (remark,) = (each for each in of_recording(path, ImuUnits.SI)[0].remarks if "own offset" in each)

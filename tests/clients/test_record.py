@@ -22,7 +22,8 @@ import pytest
 
 from bota_clients.record import cli, program, recorder
 from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch
-from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
+from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
+from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer

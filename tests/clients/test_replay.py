@@ -18,7 +18,8 @@ from typing import Any
 
 import pytest
 
-from bota_clients.recording.reader import RecordedDescription, RecordedEvent, open_recording
+from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
+from bota_clients.recording.reader import open_recording
 from bota_clients.replay import cli
 from bota_clients.replay.pacing import Pacing
 from bota_clients.replay.sensors import ReplayedSensors

@@ -30,7 +30,7 @@ from bota_clients.export.dataset import MOST_LEFT_OUT, ForeignClock, messages
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.program import interrupt_on_signals, say
-from bota_clients.recording.columns import Ints, columns
+from bota_clients.recording.columns import Ints
 from bota_clients.recording.order import TimeAxis, in_order
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import angular_rate_response
@@ -320,9 +320,9 @@ def run(options: argparse.Namespace) -> int:
     interrupt_on_signals()
     with open_recording(options.recording) as recording:
         rows, axis = [], TimeAxis()
-        for in_force, frames in axis.batches(recording.batches(choose(recording, options.sensor).sensor)):
-            table = columns(frames, options.imu_units)
-            table = table.where(table.fresh & np.isfinite(table.angular_rate).all(axis=1))
+        batches = recording.batches(choose(recording, options.sensor).sensor, options.imu_units)
+        for in_force, frames in axis.batches(batches):
+            table = frames.where(frames.fresh & np.isfinite(frames.angular_rate).all(axis=1))
             delay_s = angular_rate_response(in_force.info.settings).delay_s or 0.0
             rows.append((table.monotonic_ns - round(delay_s * 1e9), table.angular_rate))
     instants, rates = map(np.concatenate, zip(*rows, strict=True))
@@ -341,7 +341,7 @@ def run(options: argparse.Namespace) -> int:
             "the interval includes that; align shorter recordings one by one",
         )
     # The server's clocks are as far apart as at the end of the recording.
-    apart_ns = frames[-1].stamp_ns - frames[-1].monotonic_ns
+    apart_ns = int(frames.stamp_ns[-1] - frames.monotonic_ns[-1])
     offset_ms = (clock.monotonic_ns + apart_ns - clock.stamp_ns) * 1e-6
     values = clock._asdict() | {"offset_ms": offset_ms} | intervals | {"left_out": left_out}
     sys.stdout.write(json.dumps(values, indent=1) + "\n")

@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator
-from functools import cache
-from itertools import chain, islice
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
 
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
+from bota_clients.recording.columns import REGISTERS, Bools, Columns, Ints, Table
 from bota_clients.recording.order import TimeAxis
 from bota_clients.recording.reader import Recording
 from bota_ethercat.accounting import NOT_NEW
-from bota_ethercat.framing import DataFlag, DataMessage
-from bota_ethercat.pdo import Sample, SampleDecoder
+from bota_ethercat.framing import DataFlag
 from bota_ethercat.program.new_file import NewFile
 
 _SECOND: Final = 1_000_000_000
 _BEGIN: Final = 100  # frames
 VECTORS: Final = (("force", "N"), ("torque", "Nm"), ("acceleration", "m_s2"), ("angular_rate", "rad_s"))
 _FLAGS: Final = (DataFlag.GAP, DataFlag.REPEATED, DataFlag.INVALID)
-REGISTERS: Final = (
-    "force_torque_saturated", "acceleration_saturated", "angular_rate_saturated", "warnings", "status",
-)  # fmt: skip
 COLUMNS: Final = (
     "time_s", "stamp_utc", "sensor", "sequence",
     *(f"{name}_{axis}_{unit}" for name, unit in VECTORS for axis in "xyz"),
@@ -34,16 +29,33 @@ COLUMNS: Final = (
     *(str(flag.name).lower() for flag in _FLAGS),
     *REGISTERS,
 )  # fmt: skip
+_GAP: Final = int(DataFlag.GAP)
+# Nine digits keep a REAL32 to the bit.
+_TURNED: Final = [f"orientation.{axis}" for axis in "xyzw"]
+_ORIENTATION: Final = ",".join(["%.9g"] * 4)
+_WHOLE: Final = ["%d"] * (len(_FLAGS) + len(REGISTERS))
+_LINE: Final = ",".join(["%.9f,%sZ,%d,%d", *["%.9g"] * 13, "%s", *_WHOLE]) + "\n"
 
 
-def new_samples(frames: Iterable[DataMessage], gaps: dict[int, int]) -> Iterator[DataMessage]:
-    """Those that are new and valid; a GAP of others is also the next sample's, of which `gaps` knows."""
-    for frame in frames:
-        flags = frame.flags | gaps.pop(frame.sensor, 0)
-        if flags & NOT_NEW:
-            gaps[frame.sensor] = flags & DataFlag.GAP
-        else:
-            yield frame._replace(flags=flags) if flags != frame.flags else frame
+class NewSamples:
+    """Finds the frames that are new and valid samples; a GAP of others is also the next sample's."""
+
+    def __init__(self) -> None:
+        self._gaps = set[int]()  # sensors that had one since their latest sample
+
+    def among(self, flags: Ints, sensor: int) -> tuple[Bools, Ints]:
+        """(n,) which of the next frames of a sensor are, and the flags of all with those GAPs."""
+        is_new, is_gap = (flags & NOT_NEW) == 0, (flags & _GAP) != 0
+        if is_new.all() and sensor not in self._gaps:
+            return is_new, flags
+        gaps = np.append(int(sensor in self._gaps), is_gap).cumsum()
+        at = np.flatnonzero(is_new)
+        told, found = gaps[at + 1], flags.copy()
+        found[at[np.diff(told, prepend=0) > 0]] |= _GAP
+        self._gaps.discard(sensor)
+        if gaps[-1] > told[-1:].max(initial=0):
+            self._gaps.add(sensor)
+        return is_new, found
 
 
 def write(options: argparse.Namespace, recording: Recording) -> str:
@@ -52,33 +64,40 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     if not there or options.sensor not in {None, *there}:
         which = "" if options.sensor is None else f" of sensor {options.sensor}"
         raise RecordingError(f"{recording.path} has no samples{which}")
-    decoder = cache(lambda size: SampleDecoder(size, options.imu_units))
-    written, axis, first_ns = 0, TimeAxis(), -1
-    frames = recording.frames(options.sensor)
-    if not options.all:
-        frames = new_samples(frames, {})
-    # Of several sensors another's may be the earliest.
-    begin = [*islice(frames, _BEGIN)]
-    moments = [frame.monotonic_ns for frame in begin]
-    first_ns = min((each for each in moments if each > moments[0] - _SECOND), default=0)
+    rows, axis, first_ns, new = 0, TimeAxis(), -1, NewSamples()
     with NewFile(options.output, force=options.force) as file:
         file.write(",".join(COLUMNS) + "\n")
-        for frame in chain(begin, frames):
-            written += 1
-            place_ns = axis.place(frame)
-            first_ns = place_ns if first_ns < 0 else first_ns
-            sample = decoder(len(frame.process_data)).decode(frame.process_data)
-            when = f"{(place_ns - first_ns) / _SECOND:.9f},{np.datetime64(frame.stamp_ns, 'ns')}Z"
-            file.write(f"{when},{frame.sensor},{frame.sequence},{_values(sample, frame.flags)}\n")
+        tables = recording.tables(options.sensor)
+        for table in (each for each in tables if isinstance(each, np.ndarray)):
+            flags, is_kept = table["flags"].astype(np.int64), np.ones(len(table), bool)
+            if not options.all:
+                for sensor in np.unique(table["sensor"]).tolist():
+                    own = table["sensor"] == sensor
+                    is_kept[own], flags[own] = new.among(flags[own], sensor)
+            kept = table if is_kept.all() else table[is_kept]
+            found = Columns.of(kept, options.imu_units)
+            if first_ns < 0 and len(found):  # of several sensors another's may be the earliest
+                moments = found.monotonic_ns[:_BEGIN]
+                first_ns = int(moments[moments > moments[0] - _SECOND].min())
+            places = axis.places(found.monotonic_ns, found.stamp_ns)
+            file.write("".join(_lines(kept, found, flags[is_kept], places, first_ns)))
+            rows += len(found)
         file.finish()
-    left_out = (sum(there.values()) if options.sensor is None else there[options.sensor]) - written
+    left_out = (sum(there.values()) if options.sensor is None else there[options.sensor]) - rows
     left = f"; {count(left_out, 'frame')} without a new sample left out" if left_out else ""
-    return "; ".join([f"{count(written, 'sample')}{left}", *axis.said])
+    return "; ".join([f"{count(rows, 'sample')}{left}", *axis.said])
 
 
-def _values(sample: Sample, flags: int) -> str:
-    # Nine digits keep a REAL32 to the bit.
-    reals = ",".join([f"{value:.9g}" for value in (*sample.array, sample.temperature)])
-    orientation = ",".join([f"{value:.9g}" for value in sample.orientation or ()]) or ",,,"
-    whole = [int(bool(flags & flag)) for flag in _FLAGS] + [getattr(sample, name) for name in REGISTERS]
-    return f"{reals},{orientation},{','.join(map(str, whole))}"
+def _lines(table: Table, samples: Columns, flags: Ints, places: Ints, first_ns: int) -> Iterator[str]:
+    reals = np.column_stack([*(getattr(samples, name) for name, _ in VECTORS), samples.temperature])
+    turned = ["," * 3] * len(samples)
+    if _TURNED[0] in (table.dtype.names or ()):
+        parts = np.column_stack([table[name] for name in _TURNED])
+        for row in np.flatnonzero(parts.any(axis=1)).tolist():
+            turned[row] = _ORIENTATION % (*parts[row].tolist(),)
+    marks = [((flags & int(flag)) != 0).astype(int).tolist() for flag in _FLAGS]
+    times = [place / _SECOND for place in (places - first_ns).tolist()]
+    stamps = np.datetime_as_string(samples.stamp_ns.view("datetime64[ns]")).tolist()
+    columns = [table["sensor"].tolist(), table["sequence"].tolist(), *reals.T.tolist(), turned, *marks]
+    columns += [table[name].tolist() for name in REGISTERS]
+    return map(_LINE.__mod__, zip(times, stamps, *columns, strict=True))

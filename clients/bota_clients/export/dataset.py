@@ -37,7 +37,6 @@ from bota_clients.numbers import count
 from bota_clients.recording.columns import Ints
 from bota_clients.recording.order import TimeAxis, in_order, longest_order
 from bota_clients.recording.reader import Recording, Since
-from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.errors import BadMessageError, FileError
 from bota_ethercat.program.command import command
 from bota_ethercat.program.new_file import EXISTS
@@ -168,20 +167,21 @@ class Stamped:
         Which is not its first if the clock was set.
         """
         self._leave_out(recording, sensor)
-        new = (each.stamp_ns for each in recording.frames(sensor) if not each.flags & NOT_NEW)
-        first_ns, stamps = next(new, 0), self._stamps
-        if not self.strict and self._clock is None and first_ns - _NEAR_NS < stamps[0] < first_ns:
+        stamps, is_near = self._stamps, self._clock is None and not self.strict
+        new = (part.stamp_ns[part.fresh] for _, part in recording.batches(sensor))
+        first_ns = next((int(part[0]) for part in new if len(part)), 0)
+        if is_near and first_ns - _NEAR_NS < stamps[0] < first_ns:
+            lowest_ns = min((int(part.min(initial=first_ns)) for part in new), default=first_ns)
             ascending = stamps[: int(np.append(np.flatnonzero(np.diff(stamps) < 0), len(stamps))[0]) + 1]
-            self._early = int(np.searchsorted(ascending, min(first_ns, min(new, default=first_ns))))
+            self._early = int(np.searchsorted(ascending, lowest_ns))
 
     def _leave_out(self, recording: Recording, sensor: int) -> None:
         """What is not later than the row before, unless the clock was set back, or it is much."""
         kept = in_order(self._stamps)
         if self._clock is None and not kept.all():
             batches = TimeAxis().batches(recording.batches(sensor))
-            new = [each for _, batch in batches for each in batch if not each.flags & NOT_NEW]
-            both = np.array([(each.stamp_ns, each.monotonic_ns) for each in new], np.int64).reshape(-1, 2)
-            kept = longest_order(self._places(*both.T))
+            new = [np.stack([each.stamp_ns, each.monotonic_ns])[:, each.fresh] for _, each in batches]
+            kept = longest_order(self._places(*np.hstack([np.zeros((2, 0), np.int64), *new])))
         if (~kept).mean() <= MOST_LEFT_OUT:
             self.left_out = int((~kept).sum())
             self._rows, self._stamps, self._left = self._rows[kept], self._stamps[kept], self._left[kept]
@@ -382,10 +382,10 @@ def windows_of(
     if stamped is not None:
         stamped.begin(recording, sensor)
     done, first, clocks, waiting = 0, *(np.zeros((2, 0), np.int64) for _ in range(3))
-    batches = (axis or TimeAxis()).batches(recording.batches(sensor))
-    for in_force, batch in itertools.chain(batches, [(None, [])]):
+    batches = (axis or TimeAxis()).batches(recording.batches(sensor, windows.imu_units))
+    for in_force, batch in itertools.chain(batches, [(None, None)]):
         until_ns = windows.until_ns
-        if in_force is not None:
+        if in_force is not None and batch is not None:
             windows.configure(in_force)
             samples = windows.add(batch)
             clocks = np.hstack([clocks[:, -1:], (samples.stamp_ns, samples.monotonic_ns)])

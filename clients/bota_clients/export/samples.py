@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.csv_table import REGISTERS, VECTORS, new_samples
+from bota_clients.export.csv_table import VECTORS, NewSamples
 from bota_clients.export.windows import Array, Arrays, Windows, interpolated
-from bota_clients.recording.columns import RECORD, Columns, joined
+from bota_clients.recording.columns import RECORD, REGISTERS, Columns, joined
 from bota_clients.recording.order import TimeAxis
 from bota_clients.recording.reader import Recording
 from bota_ethercat.framing import DataFlag
@@ -32,13 +33,14 @@ def samples_of(
 
     On `axis`, by default a new one. RecordingError.
     """
-    batches = (axis or TimeAxis()).batches(recording.batches(sensor))
-    held, first_ns, gaps = list[Columns](), 0, dict[int, int]()
+    batches = (axis or TimeAxis()).batches(recording.batches(sensor, windows.imu_units))
+    held, first_ns, new = list[Columns](), 0, NewSamples()
     begin, taken = 0, 0  # samples: number of the first that is held, and how many were taken
-    for in_force, batch in itertools.chain(batches, [(None, [])]):
-        if in_force is not None:
+    for in_force, batch in itertools.chain(batches, [(None, None)]):
+        if in_force is not None and batch is not None:
             windows.configure(in_force)
-            samples = windows.add([*new_samples(batch, gaps)])
+            is_new, flags = new.among(batch.flags, sensor)
+            samples = windows.add(replace(batch, flags=flags).where(is_new))
             held = [joined([*held, samples])]
         slots = windows.take(rest=in_force is None)
         if not len(slots):

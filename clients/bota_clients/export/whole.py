@@ -15,7 +15,8 @@ from typing import Final
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import PROGRAM
 from bota_clients.numbers import count
-from bota_clients.recording.reader import RecordedDescription, RecordedEvent, Recording
+from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
+from bota_clients.recording.reader import Recording
 from bota_clients.recording.writer import DiskFile, RecordingWriter
 from bota_ethercat.program.new_file import refuse_existing
 from bota_ethercat.program.version import VERSION

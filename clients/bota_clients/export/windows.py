@@ -2,7 +2,7 @@
 
     windows = Windows(32)
     windows.configure(row["settings"], row["rate_hz"], row["name"], row["offset"])  # whenever they change
-    windows.add(frames)  # DATA messages of one sensor, in order
+    windows.add(columns(frames))  # DATA messages of one sensor, in order
     arrays = windows.at(np.array([windows.until_ns]))
 
 Samples are in slots, one for each period of the sensor; the slot of a lost sample stays empty. A sample was
@@ -13,7 +13,7 @@ stamps are ns of the server's CLOCK_MONOTONIC.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,9 +22,8 @@ import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
 from bota_clients.identify.tool_file import tool_parameters
-from bota_clients.recording.columns import Columns, Ints, columns
-from bota_ethercat.accounting import NOT_NEW
-from bota_ethercat.framing import DataFlag, DataMessage
+from bota_clients.recording.columns import Columns, Ints
+from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.replies import Delays
 from bota_ethercat.sensor.response import delays_ms
@@ -81,7 +80,7 @@ class Windows:
     ) -> None:
         """Of `length` samples. With a `tool`, parameters of the ROS 2 node, there is a compensated wrench."""
         self.begin_ns = -1
-        self._length, self._units = length, imu_units
+        self._length, self.imu_units = length, imu_units
         self.stream: CompensatedStream | None = None
         self._slots = np.zeros(0, _SLOT)
         self._newest = (0, 0)  # stamp and sequence of the newest sample
@@ -130,9 +129,9 @@ class Windows:
         """The last instant of which nothing that comes later can be a part; -1 before the first sample."""
         return int(self._slots["measured_ns"].max(axis=0, initial=-1).min())
 
-    def add(self, frames: Sequence[DataMessage]) -> Columns:
+    def add(self, frames: Columns) -> Columns:
         """Take the next frames of the sensor, also REPEATED and INVALID ones; the samples. RecordingError."""
-        samples = columns((each for each in frames if not each.flags & NOT_NEW), self._units)
+        samples = frames if frames.fresh.all() else frames.where(frames.fresh)
         if not len(samples):
             return samples
         stamps, sequence = samples.monotonic_ns, samples.sequence

@@ -13,7 +13,8 @@ import numpy as np
 from bota_clients.errors import RecordingError
 from bota_clients.identify.program import choose
 from bota_clients.program import say
-from bota_clients.recording.columns import Columns, at_last_offset
+from bota_clients.recording.columns import Columns, joined
+from bota_clients.recording.order import AtLastOffset
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import force_lag_s
 from bota_ethercat.settings import SettingValue
@@ -25,8 +26,9 @@ from bota_ft_compensation.quantities import CompensationError
 def run(options: argparse.Namespace) -> int:
     with open_recording(options.path) as recording:
         sensor = choose(recording, options.sensor)
-        data, _, remarks = at_last_offset(recording, sensor, options.imu_units)
-    for remark in remarks:
+        read = AtLastOffset(recording, sensor, options.imu_units)
+        data = joined([*read])
+    for remark in read.said:
         say("ethercat-identify", f"{options.path}: {remark}")
     if any(row.info.settings != sensor.info.settings for row in sensor.history):
         raise RecordingError(f"{options.path}: settings were changed during it: record without that")

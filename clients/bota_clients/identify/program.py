@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import heapq
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -22,7 +23,8 @@ from bota_clients.identify.stationary_periods import (
 )
 from bota_clients.identify.tool_file import write_bota
 from bota_clients.program import say
-from bota_clients.recording.columns import Columns, at_last_offset
+from bota_clients.recording.columns import Columns, Floats
+from bota_clients.recording.order import AtLastOffset
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.program.new_file import refuse_existing
@@ -46,9 +48,52 @@ from bota_ft_compensation.quantities import (
 from bota_ft_compensation.stream import obstacle
 
 _WIDTH: Final = 80  # every table fits
+_PART_S: Final = 10.0
+_MOST_MOTION_S: Final = 180.0  # more tells little more, and takes memory
 Poses = Sequence[tuple[StationaryPeriod, Pose]]
 
 _say = partial(say, "ethercat-identify")
+
+
+class _Motion:
+    """The usable samples of a recording, of a long one those parts in which the sensor turned the most."""
+
+    def __init__(self) -> None:
+        self._begin_ns, self._seconds, self._number = -1, 0.0, 0
+        self._part, self._kept = list[Floats](), list[tuple[float, int, float, Floats]]()
+
+    def passing(self, parts: Iterable[Columns]) -> Iterator[Columns]:
+        """The same, which are taken from."""
+        for part in parts:
+            self._add(part.where(part.fresh))
+            yield part
+        self._end_part()
+
+    def rows(self) -> tuple[Floats, Floats]:
+        """Times (n,), s since the first sample, and what `usable_rows` gives (n, 12)."""
+        parts = [rows for _, _, _, rows in sorted(self._kept, key=lambda each: each[1])]
+        found = np.concatenate([np.zeros((0, 13)), *parts])
+        return found[:, 0], np.ascontiguousarray(found[:, 1:])
+
+    def _add(self, fresh: Columns) -> None:
+        if not len(fresh):
+            return
+        self._begin_ns = int(fresh.monotonic_ns[0]) if self._begin_ns < 0 else self._begin_ns
+        rows, good = usable_rows(fresh)
+        times = (fresh.monotonic_ns - self._begin_ns) * 1e-9
+        self._part.append(np.column_stack([times, rows])[good])
+        if len(self._part[-1]) and times[-1] - next(each for each in self._part if len(each))[0, 0] > _PART_S:
+            self._end_part()
+
+    def _end_part(self) -> None:
+        rows, self._part = np.concatenate([np.zeros((0, 13)), *self._part]), []
+        if not len(rows):
+            return
+        seconds, turned = float(np.ptp(rows[:, 0])), float(rows[:, 10:].var(axis=0).sum())
+        self._number, self._seconds = self._number + 1, self._seconds + seconds
+        heapq.heappush(self._kept, (turned, self._number, seconds, rows))
+        while self._seconds - self._kept[0][2] > _MOST_MOTION_S:
+            self._seconds -= heapq.heappop(self._kept)[2]
 
 
 def show_poses(console: Console, poses: Poses, result: Identified | None) -> None:
@@ -158,19 +203,20 @@ def run(options: argparse.Namespace) -> int:
         for row in sensor.history:
             if why := obstacle(row.info.settings, has_tool=True, by_imu=True):
                 raise RecordingError(f"{options.path} does not show a tool: {why}; and record again")
-        data, offset, remarks = at_last_offset(recording, sensor, options.imu_units)
-    for remark in remarks:
+        read = AtLastOffset(recording, sensor, options.imu_units)
+        motion, offset = _Motion(), read.offset
+        periods, rejected = find_stationary_periods(motion.passing(read))
+    for remark in read.said:
         _say(f"{options.path}: {remark}")
-    periods, rejected = find_stationary_periods(data)
     if len(periods) > MOST_POSES:
         periods = sorted(sorted(periods, key=lambda period: -period.seconds)[:MOST_POSES])
         _say(f"there are more than {MOST_POSES} poses: the longest are used")
     poses, result, error = _solve(periods, options)
     if result is not None:
-        result = _with_inertia(result, data, sensor)
+        result = _with_inertia(result, motion, sensor)
     elif coverage([pose for _, pose in poses]).missing is not None:
         try:
-            result, poses = _in_motion(data, sensor), ()
+            result, poses = _in_motion(motion, sensor), ()
         except CompensationError as refusal:
             error = f"{error}; or, by motion alone: {refusal}"
     if result is not None:
@@ -216,38 +262,36 @@ def _write_files(
             )
 
 
-def _with_inertia(result: Identified, data: Columns, sensor: RecordedSensor) -> Identified:
+def _with_inertia(result: Identified, motion: _Motion, sensor: RecordedSensor) -> Identified:
     """The tool's inertia too, as far as the recording has motion."""
     try:
-        return _inertia(result, data, sensor)
+        return _inertia(result, motion, sensor)
     except CompensationError as refusal:
         return result._replace(notes=(f"the tool's inertia is not identified: {refusal}", *result.notes))
 
 
-def _in_motion(data: Columns, sensor: RecordedSensor) -> Identified:
+def _in_motion(motion: _Motion, sensor: RecordedSensor) -> Identified:
     """All by free motion, of which no body of negative inertia is a part either; CompensationError."""
-    return _inertia(identify_in_motion(_turned(data, sensor, EXACT), _imu(sensor)), data, sensor)
+    return _inertia(identify_in_motion(_turned(motion, sensor, EXACT), _imu(sensor)), motion, sensor)
 
 
-def _inertia(result: Identified, data: Columns, sensor: RecordedSensor) -> Identified:
+def _inertia(result: Identified, motion: _Motion, sensor: RecordedSensor) -> Identified:
     calibration = result.accelerometer.calibration if result.accelerometer else EXACT
-    return identify_inertia(_turned(data, sensor, calibration), result)
+    return identify_inertia(_turned(motion, sensor, calibration), result)
 
 
 def _imu(sensor: RecordedSensor) -> Vector3:
     return imu_position(sensor.info.name)
 
 
-def _turned(data: Columns, sensor: RecordedSensor, calibration: Accelerometer) -> Turned:
+def _turned(motion: _Motion, sensor: RecordedSensor, calibration: Accelerometer) -> Turned:
     if any(row.info.settings != sensor.info.settings for row in sensor.history):
         raise CompensationError("settings were changed during the recording")
-    data = data.where(data.fresh)
-    rows, good = usable_rows(data)
-    times = np.asarray((data.monotonic_ns - data.monotonic_ns[:1])[good] * 1e-9)
+    times, rows = motion.rows()
     if not len(times):
         raise CompensationError("no sample can be used")
     alignment = align(sensor.info.settings, sensor.info.rate_hz)
-    return turn(times, rows[good], alignment, calibration, _imu(sensor))
+    return turn(times, rows, alignment, calibration, _imu(sensor))
 
 
 def choose(recording: Recording, position: int | None) -> RecordedSensor:

@@ -8,7 +8,7 @@ must pass the same test as a pose that is taken live.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -27,6 +27,8 @@ from bota_ft_compensation.stationary import (
 LEAST_S: Final = 1.0  # shorter periods are no poses
 _BLOCK_S: Final = 0.1
 _BLOCK_SAMPLES: Final = 8  # at least, however slow the sensor is
+_ENOUGH: Final = 512  # samples that tell how far apart they are
+_MOST_SAMPLES: Final = 200_000  # longer periods are divided, so that memory is bounded
 _SAME_POSE: Final = math.cos(math.radians(1.5))
 _LIMITS: Final = StationaryLimits()
 
@@ -38,35 +40,14 @@ class StationaryPeriod(NamedTuple):
 
 
 def find_stationary_periods(
-    columns: Columns, least_seconds: float = LEAST_S
+    parts: Iterable[Columns], least_seconds: float = LEAST_S
 ) -> tuple[list[StationaryPeriod], list[str]]:
     """The stationary periods of at least `least_seconds`, in order; sentences about those that nearly are."""
-    fresh = columns.where(columns.fresh)
-    periods: list[StationaryPeriod] = []
-    rejected: list[str] = []
-    if len(fresh) < _BLOCK_SAMPLES:
-        return periods, rejected
-    rows, good = usable_rows(fresh)
-    times = (fresh.monotonic_ns - fresh.monotonic_ns[0]) * 1e-9
-    rows = np.where(good[:, np.newaxis], rows, 0.0)
-    for part in stretches(times, GAP_S):
-        if part.stop - part.start < 3 * _BLOCK_SAMPLES:
-            continue
-        for begin, end in _stretches(times[part], rows[part], good[part]):
-            first, last = part.start + begin, part.start + end
-            seconds = float(times[last - 1] - times[first])
-            if seconds < least_seconds:
-                continue
-            try:
-                means = stationary_means(rows[first:last], _LIMITS)
-            except NotStationaryError as error:
-                rejected.append(f"{times[first]:.1f} s to {times[last - 1]:.1f} s: {error}")
-            else:
-                middle_s = float(times[first]) + 0.5 * seconds
-                periods.append(
-                    StationaryPeriod(float(times[first]), seconds, means._replace(time_s=middle_s))
-                )
-    return periods, rejected
+    found = _Finder(least_seconds)
+    for part in parts:
+        found.add(part)
+    found.end_stretch()
+    return found.periods, found.rejected
 
 
 def usable_rows(columns: Columns) -> tuple[Floats, Bools]:
@@ -77,33 +58,90 @@ def usable_rows(columns: Columns) -> tuple[Floats, Bools]:
     return rows, good
 
 
-def _stretches(times: Floats, rows: Floats, good: Bools) -> Iterator[tuple[int, int]]:
-    """First row and the row after the last one of every period, without its first and last block."""
-    period = float(times[-1] - times[0]) / (len(times) - 1)
-    size = max(_BLOCK_SAMPLES, round(_BLOCK_S / period))
-    count = len(rows) // size
-    blocks = rows[: count * size].reshape(count, size, rows.shape[1])
-    mean, deviation = blocks.mean(axis=1), blocks.std(axis=1, ddof=1)
-    quiet = good[: count * size].reshape(count, size).all(axis=1)
-    quiet &= (deviation <= _LIMITS.deviations).all(axis=1)
-    quiet &= np.linalg.norm(mean[:, 9:12], axis=1) <= _LIMITS.angular_rate
+_TIME, _GOOD, _ROW = 0, 1, slice(2, None)  # columns of what `_Finder` holds
 
-    def is_same_period(start: int, number: int) -> bool:
-        """Whether block `number` belongs to the period that began with block `start`."""
-        if not (quiet[start] and quiet[number]):
+
+class _Finder:
+    """Finds the periods while samples come; holds those of the period that goes on."""
+
+    def __init__(self, least_seconds: float) -> None:
+        self.periods, self.rejected = list[StationaryPeriod](), list[str]()
+        self._least_s, self._begin_ns = least_seconds, -1
+        self._rest, self._held = (
+            np.zeros((0, 14)),
+            list[Floats](),
+        )  # of no whole block yet; blocks of the period
+        self._size = 0  # samples in a block; 0: to be told by the first ones of the stretch
+        self._last_s = -math.inf
+
+    def add(self, frames: Columns) -> None:
+        fresh = frames.where(frames.fresh)
+        if not len(fresh):
+            return
+        self._begin_ns = int(fresh.monotonic_ns[0]) if self._begin_ns < 0 else self._begin_ns
+        rows, good = usable_rows(fresh)
+        times = (fresh.monotonic_ns - self._begin_ns) * 1e-9
+        table = np.column_stack([times, good, np.where(good[:, np.newaxis], rows, 0.0)])
+        for part in stretches(np.append(self._last_s, times), GAP_S):
+            if part.start:
+                self.end_stretch()
+            self._rest = np.concatenate([self._rest, table[max(part.start - 1, 0) : part.stop - 1]])
+            if self._size or len(self._rest) >= _ENOUGH:
+                self._take()
+        self._last_s = float(times[-1])
+
+    def end_stretch(self) -> None:
+        """A gap, or the end."""
+        if len(self._rest) >= 3 * _BLOCK_SAMPLES or self._size:
+            self._take()
+        self._end_period()
+        self._rest, self._size = self._rest[:0], 0
+
+    def _take(self) -> None:
+        rest = self._rest
+        if not self._size:
+            period = float(rest[-1, _TIME] - rest[0, _TIME]) / (len(rest) - 1)
+            self._size = max(_BLOCK_SAMPLES, round(_BLOCK_S / period))
+        count = len(rest) // self._size
+        blocks, self._rest = (
+            rest[: count * self._size].reshape(count, self._size, 14),
+            rest[count * self._size :],
+        )
+        mean, deviation = blocks[:, :, _ROW].mean(axis=1), blocks[:, :, _ROW].std(axis=1, ddof=1)
+        quiet = blocks[:, :, _GOOD].all(axis=1) & (deviation <= _LIMITS.deviations).all(axis=1)
+        quiet &= np.linalg.norm(mean[:, 9:12], axis=1) <= _LIMITS.angular_rate
+        for number in range(count):
+            if not self._continues(quiet[number], mean[number], deviation[number]):
+                self._end_period()
+                self._start = quiet[number], mean[number], deviation[number]
+            self._held.append(blocks[number])
+
+    def _continues(self, is_quiet: bool, mean: Floats, deviation: Floats) -> bool:
+        """Whether a block belongs to the period that goes on."""
+        if not self._held or len(self._held) * self._size >= _MOST_SAMPLES:
             return False
-        a, b = mean[start], mean[number]
-        sizes = float(np.linalg.norm(a[6:9]) * np.linalg.norm(b[6:9]))
-        if float(a[6:9] @ b[6:9]) < _SAME_POSE * sizes:
+        was_quiet, a, its_deviation = self._start
+        if not (was_quiet and is_quiet):
             return False
-        by_chance = CHANCE * (deviation[start] + deviation[number]) / math.sqrt(size)
-        moved = np.abs(b - a) - by_chance
+        sizes = float(np.linalg.norm(a[6:9]) * np.linalg.norm(mean[6:9]))
+        if float(a[6:9] @ mean[6:9]) < _SAME_POSE * sizes:
+            return False
+        by_chance = CHANCE * (its_deviation + deviation) / math.sqrt(self._size)
+        moved = np.abs(mean - a) - by_chance
         return bool((moved[:6] <= _LIMITS.drifts[:6]).all())  # of the acceleration the pose was compared
 
-    start = 0
-    for number in range(1, count + 1):
-        if number < count and is_same_period(start, number):
-            continue
-        if quiet[start] and number - start >= 3:
-            yield (start + 1) * size, (number - 1) * size
-        start = number
+    def _end_period(self) -> None:
+        held, self._held = self._held, []
+        if len(held) < 3 or not self._start[0]:
+            return
+        rows = np.concatenate(held[1:-1])
+        first_s, last_s = rows[[0, -1], _TIME].tolist()
+        if last_s - first_s < self._least_s:
+            return
+        try:
+            means = stationary_means(rows[:, _ROW], _LIMITS)
+        except NotStationaryError as error:
+            self.rejected.append(f"{first_s:.1f} s to {last_s:.1f} s: {error}")
+        else:
+            means = means._replace(time_s=first_s + 0.5 * (last_s - first_s))
+            self.periods.append(StationaryPeriod(first_s, last_s - first_s, means))

@@ -18,7 +18,7 @@ from bota_clients.errors import RecordingError
 from bota_clients.numbers import duration
 from bota_clients.program import Signals, say
 from bota_clients.record.recorder import NAME, Batch, Recorder, RecordingClient, notes, record
-from bota_clients.recording.reader import RecordedEvent
+from bota_clients.recording.file_format import RecordedEvent
 from bota_ethercat.control import event_sentence
 from bota_ethercat.errors import RefusedError
 from bota_ethercat.program.new_file import refuse_existing

@@ -1,24 +1,19 @@
-"""A sensor's frames as NumPy arrays, one row per frame, bit-identical to what `bota_ethercat.pdo` decodes.
-
-The offset that the sensor itself adds to every sample (object 0x8000) may change in a recording. The server
-reports a change once all six numbers are written, which takes some exchanges: samples shortly before that
-have some of them.
-"""
+"""A sensor's frames as NumPy arrays, one row per frame, bit-identical to what `bota_ethercat.pdo` decodes."""
 
 from __future__ import annotations
 
+import functools
 import math
-from array import array
+import operator
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from bota_clients.numbers import count
-from bota_clients.recording.order import TimeAxis
-from bota_clients.recording.reader import RecordedSensor, Recording
+from bota_clients.recording import file_format
+from bota_clients.recording.mcap_file import HEAD, RECORD_HEAD, Rows
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import LAYOUTS, STANDARD_GRAVITY, ImuUnits
@@ -26,11 +21,57 @@ from bota_ethercat.pdo import LAYOUTS, STANDARD_GRAVITY, ImuUnits
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
+Whole = npt.NDArray[Any]  # unsigned integers of the size that they are sent in
+Table = npt.NDArray[np.void]  # (n,) of one of RECORDS
 
-# The largest process data as a NumPy record, from the table. The smaller begins alike.
-_SIZE: Final = max(LAYOUTS)
-RECORD: Final = np.dtype([(field.name, "<" + field.type.value) for field in LAYOUTS[_SIZE].fields])
 _MAX: Final = (1 << 63) - 1
+REGISTERS: Final = (
+    "force_torque_saturated", "acceleration_saturated", "angular_rate_saturated", "warnings", "status",
+)  # fmt: skip
+_TIMES: Final = ("sequence", "stamp_ns", "monotonic_ns")
+_WHOLE: Final = ("flags", "wkc", *REGISTERS)
+_HEADS: Final = HEAD - RECORD_HEAD + file_format.FRAME_SIZE  # of the length of a record
+_VECTORS: Final = {
+    name: [f"{name}.{axis}" for axis in axes]
+    for name, axes in (
+        ("force", "xyz"), ("torque", "xyz"), ("acceleration", "xyz"), ("angular_rate", "xyz"),
+        ("orientation", "xyzw"),
+    )
+}  # fmt: skip
+
+
+def _record(size: int) -> np.dtype[np.void]:
+    """A frame with this much process data as a message in a chunk: heads, frame and fields."""
+    heads = [
+        ("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("number", "<u4"), ("logged", "<u8"),
+        ("published", "<u8"), ("cdr", "<u4"), ("sequence", "<u8"), ("stamp_ns", "<u8"),
+        ("monotonic_ns", "<u8"), ("sensor", "u1"), ("flags", "u1"), ("wkc", "<u2"), ("size", "<u4"),
+    ]  # fmt: skip
+    return np.dtype([*heads, *((field.name, "<" + field.type.value) for field in LAYOUTS[size].fields)])
+
+
+RECORDS: Final = {size: _record(size) for size in sorted(LAYOUTS)}
+RECORD: Final = RECORDS[max(LAYOUTS)]  # the smaller begins alike
+
+
+def table_of(parts: Sequence[Rows], sensors: npt.NDArray[Any]) -> Table:
+    """The frames of these sensors (n,) that are in records; RecordingError at the first that is none."""
+    widest = max(part.shape[1] for part in parts)
+    record = next((each for each in RECORDS.values() if each.itemsize >= widest), RECORD)
+    width = record.itemsize
+    if any(part.shape[1] != width for part in parts):
+        parts = [np.pad(part[:, :width], ((0, 0), (0, max(width - part.shape[1], 0)))) for part in parts]
+    table: Table = np.frombuffer(b"".join(part.data for part in parts), record)  # copied at once
+    sizes = table["size"]
+    fits = (table["cdr"] == file_format.CDR_NUMBER) & (table["sensor"] == sensors)
+    fits &= table["length"] == sizes + np.uint64(_HEADS)
+    fits &= functools.reduce(operator.or_, [sizes == each for each in LAYOUTS])
+    if not fits.all():
+        row = int(fits.argmin())
+        length = int(table["length"][row]) - (HEAD - RECORD_HEAD)
+        body = table[row].tobytes()[HEAD:].ljust(length, b"\0")[:length]
+        file_format.unpack_frame(body, int(sensors[row]))
+    return table
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,19 +84,19 @@ class Columns:
     stamp_ns: Ints  # (n,) CLOCK_REALTIME, ns since 1970
     monotonic_ns: Ints  # (n,) CLOCK_MONOTONIC of the server's machine
     sequence: Ints  # (n,)
-    flags: Ints  # (n,) bota_ethercat.framing.DataFlag
-    wkc: Ints  # (n,) working counter
-    status: Ints  # (n,)
-    warnings: Ints  # (n,) bota_ethercat.sensor.warnings_register.WarningFlag
+    flags: Whole  # (n,) bota_ethercat.framing.DataFlag
+    wkc: Whole  # (n,) working counter
+    status: Whole  # (n,)
+    warnings: Whole  # (n,) bota_ethercat.sensor.warnings_register.WarningFlag
     force: Floats  # (n, 3) N
     torque: Floats  # (n, 3) Nm
     acceleration: Floats  # (n, 3) m/s²
     angular_rate: Floats  # (n, 3) rad/s
     temperature: Floats  # (n,) °C
     orientation: Floats  # (n, 4) x, y, z, w; NaN where the sensor sends none
-    force_torque_saturated: Ints  # (n,)
-    acceleration_saturated: Ints  # (n,)
-    angular_rate_saturated: Ints  # (n,)
+    force_torque_saturated: Whole  # (n,)
+    acceleration_saturated: Whole  # (n,)
+    angular_rate_saturated: Whole  # (n,)
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -66,82 +107,50 @@ class Columns:
         fresh: Bools = (self.flags & NOT_NEW) == 0
         return fresh
 
-    def where(self, mask: Bools) -> Columns:
+    def where(self, mask: Bools | slice) -> Columns:
         """The rows where `mask` is True, for example `columns.where(columns.fresh)`."""
         return Columns(*(getattr(self, name)[mask] for name in self.__slots__))
 
+    @classmethod
+    def empty(cls, count: int) -> Columns:
+        """So many rows, to be filled."""
+        kinds = {name: RECORD[name] for name in _WHOLE} | dict.fromkeys(_TIMES, np.dtype(np.int64))
+        shapes = {name: (count, len(axes)) for name, axes in _VECTORS.items()}
+        return cls(**{name: np.empty(shapes.get(name, count), kinds.get(name)) for name in cls.__slots__})
+
+    def fill(self, table: Table, imu_units: ImuUnits) -> None:
+        """Take the frames of as many rows."""
+        for name in _WHOLE:
+            getattr(self, name)[:] = table[name]
+        for name in _TIMES:  # 64-bit values that do not fit an int64 are no valid times
+            getattr(self, name)[:] = np.minimum(table[name], _MAX)
+        self.temperature[:] = table["temperature"]
+        for name, axes in _VECTORS.items():
+            values = getattr(self, name)
+            if axes[0] not in (table.dtype.names or ()):
+                values[:] = math.nan
+                continue
+            for place, axis in enumerate(axes):
+                values[:, place] = table[axis]
+        if imu_units is ImuUnits.G_DPS:
+            np.multiply(self.acceleration, STANDARD_GRAVITY, out=self.acceleration)
+            np.multiply(self.angular_rate, math.pi / 180.0, out=self.angular_rate)
+        self.orientation[~self.orientation.any(axis=1)] = math.nan  # all zero: no estimate
+
+    @classmethod
+    def of(cls, table: Table, imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
+        """`imu_units` are the units in which the firmware sends acceleration and angular rate."""
+        found = cls.empty(len(table))
+        found.fill(table, imu_units)
+        return found
+
 
 def columns(frames: Iterable[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
-    """The frames of one sensor, for example `recording.frames(sensor=0)`.
-
-    `imu_units` are the units in which the firmware sends acceleration and angular rate.
-    """
-    heads, data = array("Q"), bytearray()
-    for frame in frames:
-        heads.extend(frame[:6])
-        data += frame.process_data.ljust(_SIZE, b"\0")
-    # 64-bit values that do not fit an int64 are no valid times.
-    whole_numbers = np.minimum(np.array(heads, np.uint64), _MAX).astype(np.int64)
-    sequence, stamp_ns, monotonic_ns, _, flags, wkc = whole_numbers.reshape(-1, 6).T
-    table = np.frombuffer(data, RECORD)
-
-    def whole(name: str) -> Ints:
-        return table[name].astype(np.int64)
-
-    def vector(name: str, axes: str = "xyz") -> Floats:
-        return np.column_stack([table[f"{name}.{axis}"] for axis in axes]).astype(np.float64)
-
-    acceleration, angular_rate = vector("acceleration"), vector("angular_rate")
-    if imu_units is ImuUnits.G_DPS:
-        acceleration *= STANDARD_GRAVITY
-        angular_rate *= math.pi / 180.0
-    orientation = vector("orientation", "xyzw")
-    orientation[~orientation.any(axis=1)] = math.nan  # all zero: no estimate
-    return Columns(
-        sequence=sequence, stamp_ns=stamp_ns, monotonic_ns=monotonic_ns, flags=flags, wkc=wkc,
-        status=whole("status"), warnings=whole("warnings"), force=vector("force"), torque=vector("torque"),
-        acceleration=acceleration, angular_rate=angular_rate,
-        temperature=table["temperature"].astype(np.float64), orientation=orientation,
-        force_torque_saturated=whole("force_torque_saturated"),
-        acceleration_saturated=whole("acceleration_saturated"),
-        angular_rate_saturated=whole("angular_rate_saturated"),
-    )  # fmt: skip
+    """Frames of one sensor that are no recording's."""
+    packed = (bytes(HEAD) + file_format.pack_frame(frame) for frame in frames)
+    data = b"".join(each.ljust(RECORD.itemsize, b"\0") for each in packed)
+    return Columns.of(np.frombuffer(data, RECORD), imu_units)
 
 
 def joined(parts: Sequence[Columns]) -> Columns:
     return Columns(*(np.concatenate([getattr(part, name) for part in parts]) for name in Columns.__slots__))
-
-
-def at_last_offset(
-    recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits
-) -> tuple[Columns, tuple[float, ...] | None, list[str]]:
-    """A sensor's columns as if its last offset had been in force all the time, that offset, and remarks.
-
-    On one axis of time, without the samples in which a change was being written, or whose offset is not known
-    where that of others is. None: the recording does not say any.
-    """
-    told = [row.info.offset for row in sensor.offsets if row.info.offset is not None]
-    nothing, axis, left_out, is_announced = (0.0,) * 6, TimeAxis(), 0, False
-    last = np.array(told[-1] if told else nothing)
-    parts, in_doubt, before = list[Columns](), list[tuple[int, int]](), last
-    for in_force, batch in axis.batches(recording.batches(sensor.sensor)):
-        if told and in_force.info.offset is None:
-            left_out, is_announced = left_out + len(batch), True
-            continue
-        part, shift = columns(batch, imu_units), last - np.array(in_force.info.offset or nothing)
-        if parts and (shift != before).any():
-            at_ns, doubt_ns = batch[0].monotonic_ns, 0 if is_announced else in_force.doubt_ns
-            in_doubt.append((at_ns - doubt_ns, at_ns + in_force.doubt_after_ns))
-        is_announced = False
-        part.force[:] += shift[:3]
-        part.torque[:] += shift[3:]
-        parts.append(part)
-        before = shift
-    found = joined(parts or [columns([])])
-    is_sure = np.ones(len(found), bool)
-    for begin_ns, end_ns in in_doubt:
-        is_sure &= (found.monotonic_ns < begin_ns) | (found.monotonic_ns > end_ns)
-    said = axis.said
-    if left_out:
-        said = [*said, f"{count(left_out, 'frame')} left out: the sensor's own offset was not known"]
-    return found.where(is_sure), told[-1] if told else None, said

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
-from typing import Final
+from typing import Final, NamedTuple
 
 from bota_clients.errors import RecordingError
 from bota_ethercat.errors import BadMessageError
@@ -49,7 +49,32 @@ _CDR: Final = b"\x00\x01\x00\x00"  # encapsulation header: little-endian, no opt
 _FRAME: Final = struct.Struct("<4sQQQBBHI")  # without padding: after the header every field is aligned
 _TEXT: Final = struct.Struct("<4sI")
 _FRAME_TOPIC: Final = re.compile(r"/ethercat/sensor_(0|[1-9][0-9]{0,2})/frames", re.ASCII)
+FRAME_SIZE: Final = _FRAME.size  # bytes before the process data
+CDR_NUMBER: Final = int.from_bytes(_CDR, "little")
 MAX_SENSOR: Final = 255
+
+
+class RecordedDescription(NamedTuple):
+    """A reply to `describe`."""
+
+    stamp_ns: int  # when it was received, ns since 1970
+    reply: JsonObject
+
+
+class RecordedEvent(NamedTuple):
+    """An event of the server, or of the recorder (`by_recorder`)."""
+
+    stamp_ns: int  # when it was received, ns since 1970
+    event: JsonObject
+
+    @property
+    def name(self) -> str:
+        return str(self.event.get("event", "?"))
+
+    @property
+    def by_recorder(self) -> bool:
+        """Whether it is the recorder's own: connected, disconnected, lost."""
+        return self.event.get("source") == RECORDER
 
 
 def frame_topic(sensor: int) -> str:

@@ -1,8 +1,8 @@
 """The MCAP container of a recording: finds the chunks, checks them, yields their messages.
 
-The `mcap` library parses the records and decompresses the chunks. Its readers are not used to find them:
-StreamReader reads a whole file before the first frame (25 times the time to open), takes a truncated record
-for a complete one, and allocates whatever a zstd frame claims to hold.
+The `mcap` library parses the records. Its readers are not used to find them: StreamReader reads a whole file
+before the first frame (25 times the time to open), takes a truncated record for a complete one, and allocates
+whatever a zstd frame claims to hold.
 
 - Opening reads record headers, and only those chunks that introduce a channel or have no message index.
 - An incomplete record at the end of a file without a footer is ignored, and `cut_off` says so.
@@ -14,18 +14,20 @@ from __future__ import annotations
 
 import os
 import struct
+import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple, Self, TypeVar
 
+import numpy as np
+import numpy.typing as npt
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata
-from mcap.stream_reader import get_chunk_data_stream
 
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
@@ -39,10 +41,17 @@ MAX_CHANNELS: Final = 4096
 
 _RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_LOOK_AHEAD: Final = 512  # records
+_SHORT: Final = 256  # bytes: longer ones than a frame
 _INDEX: Final = struct.Struct("<HI")  # channel, bytes that follow: 16 for each message
 # With the trailing magic: the last bytes of a complete file.
 _FOOTER_SIZE: Final = struct.calcsize("<BQQQI8s")
 _UNREADABLE: Final = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
+
+Rows = npt.NDArray[np.uint8]  # (n, bytes of each)
+RECORD_HEAD: Final = _RECORD.size
+HEAD: Final = RECORD_HEAD + _MESSAGE.size  # bytes before the body of a message
+CHANNEL: Final = slice(RECORD_HEAD, RECORD_HEAD + 2)  # where a message has its channel
 
 _Record = TypeVar("_Record", Channel, Chunk, Metadata)
 
@@ -53,6 +62,38 @@ class _ChunkRecord(NamedTuple):
     offset: int
     length: int
     counts: Counter[int]
+
+
+def _alike(data: memoryview, position: int, stride: int) -> int:
+    """How many records from `position` on have the same opcode and length."""
+    most, count = (len(data) - position) // stride, 0
+    head = bytes(data[position : position + RECORD_HEAD])
+    if data[position + stride : position + stride + RECORD_HEAD] != head:
+        return 1
+    heads = np.frombuffer(data, np.uint8, most * stride, position).reshape(most, stride)[:, :RECORD_HEAD]
+    while count < most:  # the cost of a look ahead is that of what it finds
+        ahead = heads[count : 2 * count + _LOOK_AHEAD]
+        if ahead.tobytes() != head * len(ahead):
+            return count + int((ahead == heads[0]).all(axis=1).argmin())
+        count += len(ahead)
+    return count
+
+
+def _padded(data: memoryview, records: list[tuple[int, int]]) -> Rows:
+    """These records of different lengths, begin and end of each."""
+    begin, end = np.array(records).T[:, :, np.newaxis]
+    places = begin + np.arange((end - begin).max())
+    rows: Rows = np.frombuffer(data, np.uint8).take(places, mode="clip")
+    rows[places >= end] = 0
+    return rows
+
+
+def message_in(row: Rows) -> tuple[int, int, memoryview]:
+    """Channel, log time (ns) and body of a message in its record."""
+    data = memoryview(row.tobytes())
+    _, length = _RECORD.unpack_from(data)
+    channel, _, log_time_ns, _ = _MESSAGE.unpack_from(data, _RECORD.size)
+    return channel, log_time_ns, data[HEAD : _RECORD.size + length]
 
 
 class McapFile:
@@ -74,6 +115,7 @@ class McapFile:
         self.counts = Counter[int]()
         self.cut_off: str | None = None
         self._chunks: list[_ChunkRecord] = []
+        self._zstd = zstandard.ZstdDecompressor()
         try:
             self._file: BinaryIO = path.open("rb")
             try:
@@ -100,14 +142,22 @@ class McapFile:
         RecordingError at the first corrupt chunk.
         """
         wanted = frozenset(channels)
+        for rows in self.rows(wanted):
+            for row in rows:
+                found = message_in(row)
+                if found[0] in wanted:
+                    yield found
+
+    def rows(self, channels: Collection[int]) -> Iterator[Rows]:
+        """The records of messages, with their heads, in file order, of chunks that have these channels.
+
+        Shorter ones are padded with zeros. RecordingError as `messages`.
+        """
         for chunk in self._chunks:
-            if wanted.isdisjoint(chunk.counts):
-                continue
-            for opcode, body in self._records_in(chunk):
-                if opcode == Opcode.MESSAGE:
-                    channel, _, log_time_ns, _ = _MESSAGE.unpack_from(body)
-                    if channel in wanted:
-                        yield channel, log_time_ns, body[_MESSAGE.size :]
+            if not chunk.counts.keys().isdisjoint(channels):
+                for opcode, rows in self._records_in(chunk):
+                    if opcode == Opcode.MESSAGE:
+                        yield rows
 
     def _open(self) -> None:
         if self._file.read(len(MAGIC)) != MAGIC:
@@ -177,30 +227,42 @@ class McapFile:
     def _index_chunk(self, chunk: _ChunkRecord) -> None:
         """Take the channels that a chunk introduces, and count its messages."""
         chunk.counts.clear()
-        for opcode, body in self._records_in(chunk):
+        for opcode, rows in self._records_in(chunk):
             if opcode == Opcode.MESSAGE:
-                chunk.counts[int.from_bytes(body[:2], "little")] += 1
+                numbers, counts = np.unique(rows[:, CHANNEL].copy().view("<u2"), return_counts=True)
+                chunk.counts.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
             elif opcode == Opcode.CHANNEL:
-                found = self._parse(Channel, body, chunk.offset)
+                found = self._parse(Channel, memoryview(rows[0])[_RECORD.size :], chunk.offset)
                 self.topics[found.id] = found.topic
                 if len(self.topics) > MAX_CHANNELS:
                     raise self._damaged(chunk.offset, f"it has more than {MAX_CHANNELS} channels")
         if unknown := chunk.counts.keys() - self.topics.keys():
             raise self._damaged(chunk.offset, f"a message is on channel {min(unknown)}, which does not exist")
 
-    def _records_in(self, chunk: _ChunkRecord) -> Iterator[tuple[int, memoryview]]:
-        """Opcode and body of every record in a chunk."""
+    def _records_in(self, chunk: _ChunkRecord) -> Iterator[tuple[int, Rows]]:
+        """Opcode and rows of every record in a chunk; messages that are alike, or short, many at once."""
         data = self._unpack(chunk)
         position, size = 0, len(data)
+        short = list[tuple[int, int]]()  # begin and end
         while position < size:
             if position + _RECORD.size > size:
                 raise self._damaged(chunk.offset, "a record in a chunk is incomplete")
             opcode, length = _RECORD.unpack_from(data, position)
-            position += _RECORD.size
-            if length > size - position or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
+            stride = _RECORD.size + length
+            if stride > size - position or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
                 raise self._damaged(chunk.offset, f"a record in a chunk claims {length} bytes")
-            yield opcode, data[position : position + length]
-            position += length
+            count = _alike(data, position, stride) if opcode == Opcode.MESSAGE else 1
+            end = position + count * stride
+            if opcode == Opcode.MESSAGE and count == 1 and stride <= _SHORT:
+                short.append((position, end))
+            else:
+                if short:
+                    yield Opcode.MESSAGE, _padded(data, short)
+                    short.clear()
+                yield opcode, np.frombuffer(data, np.uint8, end - position, position).reshape(count, stride)
+            position = end
+        if short:
+            yield Opcode.MESSAGE, _padded(data, short)
 
     def _unpack(self, chunk: _ChunkRecord) -> memoryview:
         """The decompressed records of a chunk."""
@@ -213,10 +275,12 @@ class McapFile:
                 raise ValueError(f"it is compressed with {found.compression[:16]!r}, not zstd")
             if found.compression and zstandard.frame_content_size(found.data) not in (-1, size):
                 raise ValueError("its sizes differ")
-            stream, got = get_chunk_data_stream(found, validate_crc=True)
-            if got != size:
-                raise ValueError(f"it has {got} bytes instead of {size}")
-            return memoryview(stream.read(size))
+            data = self._zstd.decompress(found.data, size) if found.compression else found.data
+            if found.uncompressed_crc not in (0, zlib.crc32(data)):
+                raise ValueError("its checksum differs")
+            if len(data) != size:
+                raise ValueError(f"it has {len(data)} bytes instead of {size}")
+            return memoryview(data)
         except _UNREADABLE as error:
             raise self._damaged(chunk.offset, f"a chunk cannot be decompressed: {error}") from None
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from bota_clients.numbers import count
-from bota_ethercat.accounting import NOT_NEW
-from bota_ethercat.framing import DataMessage
+from bota_clients.recording.columns import Columns, Ints
+from bota_clients.recording.reader import RecordedSensor, Recording
+from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.stream.timeline import InForce
 
 _SECOND: Final = 1_000_000_000
@@ -61,35 +63,43 @@ class TimeAxis:
         self._newest_ns = -1
         self._undo: tuple[int, int] | None = None  # what was before a restart, which may be a stray stamp
 
-    def place(self, frame: DataMessage) -> int:
-        """Where the next frame is, ns."""
-        now_ns, last_ns, undo, self._undo = frame.monotonic_ns, self._last_ns, self._undo, None
-        if undo and now_ns > undo[0]:
-            self.restarts -= 1
-            self._shift_ns = undo[1]
-        elif self._before_ns >= now_ns < last_ns - _SECOND:  # else the latest one was the stray
-            self.restarts += 1
-            self._undo = last_ns, self._shift_ns
-            self._shift_ns += last_ns - now_ns + max(_SECOND, frame.stamp_ns - self._stamp_ns)
-        self._before_ns, self._last_ns, self._stamp_ns = last_ns, now_ns, frame.stamp_ns
-        return min(now_ns + self._shift_ns, _MAX)
+    def places(self, monotonic_ns: Ints, stamp_ns: Ints) -> Ints:
+        """Where the next frames (n,) are, ns."""
+        before, last, stamp = self._before_ns, self._last_ns, self._stamp_ns
+        now, stamps = np.append([before, last], monotonic_ns), np.append(stamp, stamp_ns)
+        fell = np.flatnonzero((now[2:] <= now[:-2]) & (now[1:-1] - now[2:] > _SECOND)).tolist()
+        events = {row + more for row in fell for more in (0, 1)} | ({0} if self._undo else set())
+        shifts, since = np.zeros(len(monotonic_ns), np.int64), 0
+        for row in sorted(events & {*range(len(monotonic_ns))} if events else ()):
+            shifts[since:row], since = self._shift_ns, row
+            now_ns, last_ns = int(now[row + 2]), int(now[row + 1])
+            undo, self._undo = self._undo, None
+            if undo and now_ns > undo[0]:  # else the latest one was the stray
+                self.restarts -= 1
+                self._shift_ns = undo[1]
+            elif int(now[row]) >= now_ns < last_ns - _SECOND:
+                self.restarts += 1
+                self._undo = last_ns, self._shift_ns
+                passed_ns = max(_SECOND, int(stamps[row + 1] - stamps[row]))
+                self._shift_ns = min(self._shift_ns + last_ns - now_ns + passed_ns, _MAX)
+        shifts[since:] = self._shift_ns
+        if len(monotonic_ns):
+            self._before_ns, self._last_ns = now[-2:].tolist()
+            self._stamp_ns = int(stamps[-1])
+        return np.minimum(monotonic_ns, _MAX - shifts) + shifts
 
-    def batches(
-        self, batches: Iterable[tuple[InForce, list[DataMessage]]]
-    ) -> Iterator[tuple[InForce, list[DataMessage]]]:
+    def batches(self, batches: Iterable[tuple[InForce, Columns]]) -> Iterator[tuple[InForce, Columns]]:
         """Those of one sensor with their places as `monotonic_ns`, without samples out of order."""
         for in_force, batch in batches:
-            found = [each._replace(monotonic_ns=self.place(each)) for each in batch]
-            new = [number for number, each in enumerate(found) if not each.flags & NOT_NEW]
-            places = np.array([self._newest_ns, *(found[number].monotonic_ns for number in new)], np.int64)
-            later = in_order(places)[1:] & (places[1:] > self._newest_ns)
-            self._newest_ns = int(places[1:][later].max(initial=self._newest_ns))
-            if strays := {
-                number for number, is_later in zip(new, later.tolist(), strict=True) if not is_later
-            }:
-                self.left_out += len(strays)
-                found = [each for number, each in enumerate(found) if number not in strays]
-            if found:
+            places, is_kept = self.places(batch.monotonic_ns, batch.stamp_ns), np.ones(len(batch), bool)
+            found, new = replace(batch, monotonic_ns=places), places[batch.fresh]
+            is_later = in_order(np.append(self._newest_ns, new))[1:] & (new > self._newest_ns)
+            self._newest_ns = int(new[is_later].max(initial=self._newest_ns))
+            if strays := int((~is_later).sum()):
+                self.left_out += strays
+                is_kept[batch.fresh] = is_later
+                found = found.where(is_kept)
+            if len(found):
                 yield in_force, found
 
     @property
@@ -101,3 +111,51 @@ class TimeAxis:
         )
         strays = f"{count(self.left_out, 'sample')} out of order left out"
         return [restarted] * bool(self.restarts) + [strays] * bool(self.left_out)
+
+
+class AtLastOffset:
+    """Batches of a sensor as if its last own offset had been in force all the time, on one axis of time.
+
+    Without the samples in which a change was being written, or whose offset is not known where that of others
+    is: a server reports a change once all six numbers are written, an older one not before.
+
+    Attributes:
+        offset: that offset; None: the recording does not say it.
+        said: remarks, once all batches were read.
+    """
+
+    def __init__(self, recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits) -> None:
+        known = [row.info.offset for row in sensor.offsets if row.info.offset is not None]
+        self.offset, self.said = known[-1] if known else None, list[str]()
+        self._recording, self._sensor, self._units = recording, sensor, imu_units
+        self._in_doubt = list[tuple[int, int]]()
+        self._shifts = len(sensor.offsets) > 1
+        before, is_announced = None, False
+        for in_force, batch in self._batches() if self._shifts else ():
+            offset = in_force.info.offset
+            if None not in (before, offset) and offset != before:
+                at_ns, doubt_ns = int(batch.monotonic_ns[0]), 0 if is_announced else in_force.doubt_ns
+                self._in_doubt.append((at_ns - doubt_ns, at_ns + in_force.doubt_after_ns))
+            before, is_announced = offset or before, offset is None
+
+    def __iter__(self) -> Iterator[Columns]:
+        left_out = 0
+        for in_force, batch in self._batches():
+            if self._shifts:
+                if in_force.info.offset is None:
+                    left_out += len(batch)
+                    continue
+                shift = np.subtract(self.offset or (), in_force.info.offset)
+                batch.force[:] += shift[:3]
+                batch.torque[:] += shift[3:]
+            is_sure = np.ones(len(batch), bool)
+            for begin_ns, end_ns in self._in_doubt:
+                is_sure &= (batch.monotonic_ns < begin_ns) | (batch.monotonic_ns > end_ns)
+            yield batch if is_sure.all() else batch.where(is_sure)
+        if left_out:
+            self.said.append(f"{count(left_out, 'frame')} left out: the sensor's own offset was not known")
+
+    def _batches(self) -> Iterator[tuple[InForce, Columns]]:
+        axis = TimeAxis()
+        yield from axis.batches(self._recording.batches(self._sensor.sensor, self._units))
+        self.said = axis.said

@@ -16,40 +16,23 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
+import numpy as np
+import numpy.typing as npt
+
 from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
-from bota_clients.recording.mcap_file import McapFile
+from bota_clients.recording.columns import Columns, Table, joined, table_of
+from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
+from bota_clients.recording.mcap_file import CHANNEL, McapFile, Rows, message_in
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.stream.timeline import InForce, Timeline
-from bota_ethercat.text.json_text import JsonObject
 
 _MAX_NOTES: Final = 1_000_000  # descriptions and events
 _BATCH: Final = 4096  # frames
+_NOTE: Final = file_format.MAX_SENSOR + 1
 _LONGEST_CHOICE: Final = 1024  # characters of the list of chosen positions
-
-
-class RecordedDescription(NamedTuple):
-    """A reply to `describe`."""
-
-    stamp_ns: int  # when it was received, ns since 1970
-    reply: JsonObject
-
-
-class RecordedEvent(NamedTuple):
-    """An event of the server, or of the recorder (`by_recorder`)."""
-
-    stamp_ns: int  # when it was received, ns since 1970
-    event: JsonObject
-
-    @property
-    def name(self) -> str:
-        return str(self.event.get("event", "?"))
-
-    @property
-    def by_recorder(self) -> bool:
-        """Whether it is the recorder's own: connected, disconnected, lost."""
-        return self.event.get("source") == file_format.RECORDER
 
 
 class Since(NamedTuple):
@@ -168,33 +151,86 @@ class Recording(McapFile):
         """Descriptions, events and the frames of the sensor at this position, or of all, as they came."""
         return self._read(self._channels(sensor) | self._noted)
 
-    def batches(self, sensor: int) -> Iterator[tuple[InForce, list[DataMessage]]]:
+    def tables(self, sensor: int | None = None) -> Iterator[Table | RecordedDescription | RecordedEvent]:
+        """As `everything`, with the frames as arrays of a few thousand, which descriptions and events end."""
+        held, sensors, count = list[Rows](), list[npt.NDArray[Any]](), 0
+        for part in itertools.chain(self._parts(self._channels(sensor)), [None]):
+            if part is None or isinstance(part, RecordedDescription | RecordedEvent):
+                if count:
+                    yield table_of(held, np.concatenate(sensors))
+                held, sensors, count = [], [], 0
+                if part is not None:
+                    yield part
+                continue
+            rows, of = part
+            while count + len(rows) >= _BATCH:
+                left = _BATCH - count
+                yield table_of([*held, rows[:left]], np.concatenate([*sensors, of[:left]]))
+                held, sensors, count, rows, of = [], [], 0, rows[left:], of[left:]
+            held, sensors, count = [*held, rows.copy()], [*sensors, of], count + len(rows)
+
+    def batches(self, sensor: int, imu_units: ImuUnits = ImuUnits.G_DPS) -> Iterator[tuple[InForce, Columns]]:
         """Frames of the sensor at this position, a few thousand at once, with what was in force."""
         timeline, known = Timeline(), [each for each in self.sensors if each.sensor == sensor]
         in_force = timeline[sensor]
         if known and known[0].changes:  # in force before it was told
             in_force = known[0].changes[0].in_force
-        for kind, items in itertools.groupby(self.everything(sensor), type):
-            while batch := cast(Any, [*itertools.islice(items, _BATCH)]):
-                if kind is DataMessage:
-                    yield in_force, batch
-                    continue
-                for note in batch:
-                    for now in follow(timeline, note):
-                        in_force = now if now.sensor == sensor else in_force
+        for item in self.tables(sensor):
+            if isinstance(item, np.ndarray):
+                yield in_force, Columns.of(item, imu_units)
+                continue
+            for now in follow(timeline, item):
+                in_force = now if now.sensor == sensor else in_force
+
+    def columns(self, sensor: int, imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
+        """All frames of the sensor at this position as arrays, which must fit into memory."""
+        found, count = Columns.empty(sum(each.frames for each in self.sensors if each.sensor == sensor)), 0
+        for table in self.tables(sensor):
+            if isinstance(table, np.ndarray):
+                if count + len(table) > len(found):  # the index of the file is wrong
+                    found = joined([found, Columns.empty(count + len(table))])
+                found.where(slice(count, count + len(table))).fill(table, imu_units)
+                count += len(table)
+        return found.where(slice(count))
+
+    def _parts(
+        self, wanted: set[int]
+    ) -> Iterator[tuple[Rows, npt.NDArray[Any]] | RecordedDescription | RecordedEvent]:
+        """Records of frames and of what sensors they are to be, descriptions and events."""
+        sensors = np.full(1 << 16, -1, np.int16)  # by channel; of notes _NOTE
+        for channel in wanted:
+            sensors[channel] = self._sensor_of[channel]
+        sensors[[*self._noted]] = _NOTE
+        for rows in self.rows(wanted | self._noted):
+            channels = rows[:, CHANNEL].tobytes()
+            of = sensors[np.frombuffer(channels, "<u2")]
+            edges: Any = []
+            if channels != channels[:2] * len(rows):
+                rows, of = rows[of >= 0], of[of >= 0]  # noqa: PLW2901
+                edges = np.flatnonzero(np.diff(of == _NOTE)) + 1
+            elif of[0] < 0:
+                continue
+            for begin, end in itertools.pairwise([0, *edges, len(of)]):
+                if begin < end and of[begin] != _NOTE:
+                    yield rows[begin:end], of[begin:end]
+                elif begin < end:
+                    yield from (self._note(*message_in(row)) for row in rows[begin:end])
+
+    def _note(self, channel: int, log_time_ns: int, body: memoryview) -> RecordedDescription | RecordedEvent:
+        topic = self.topics[channel]
+        said = file_format.unpack_json(body, topic)
+        is_reply = topic == file_format.DESCRIPTION_TOPIC
+        return RecordedDescription(log_time_ns, said) if is_reply else RecordedEvent(log_time_ns, said)
 
     def _channels(self, sensor: int | None) -> set[int]:
         return {number for number, position in self._sensor_of.items() if sensor in (None, position)}
 
     def _read(self, channels: set[int]) -> Iterator[DataMessage | RecordedDescription | RecordedEvent]:
         for channel, log_time_ns, body in self.messages(channels):
-            position, topic = self._sensor_of.get(channel), self.topics[channel]
-            if position is not None:
+            if (position := self._sensor_of.get(channel)) is not None:
                 yield file_format.unpack_frame(body, position)
-            elif topic == file_format.DESCRIPTION_TOPIC:
-                yield RecordedDescription(log_time_ns, file_format.unpack_json(body, topic))
             else:
-                yield RecordedEvent(log_time_ns, file_format.unpack_json(body, topic))
+                yield self._note(channel, log_time_ns, body)
 
 
 def open_recording(path: Path) -> Recording:

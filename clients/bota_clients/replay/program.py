@@ -13,7 +13,8 @@ from typing import Any, Final, NoReturn
 
 from bota_clients.errors import RecordingError
 from bota_clients.program import Signals, say
-from bota_clients.recording.reader import RecordedDescription, RecordedEvent, Recording, open_recording
+from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
+from bota_clients.recording.reader import Recording, open_recording
 from bota_clients.replay.pacing import Pacing
 from bota_clients.replay.sensors import ReplayedSensors, needs_sensor
 from bota_ethercat.control import Event, event

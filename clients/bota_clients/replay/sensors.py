@@ -7,7 +7,8 @@ from collections import Counter
 from itertools import takewhile
 from typing import Any, Final, NoReturn
 
-from bota_clients.recording.reader import RecordedDescription, RecordedEvent, Recording, follow
+from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
+from bota_clients.recording.reader import Recording, follow
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.control import ErrorCode, Event, Request, event
 from bota_ethercat.errors import RequestError

@@ -94,11 +94,11 @@ def _subject(recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits) 
     # The order in the file decides what came first, because clocks differ.
     stretches: list[tuple[SensorInfo, list[Columns]]] = [(sensor.info, [columns([])])]
     lost = dict[int, str]()  # by stretch: what the server said when it lost the sensor in it
-    for in_force, frames in recording.batches(sensor.sensor):
+    for in_force, frames in recording.batches(sensor.sensor, imu_units):
         was, info = stretches[-1][0], in_force.info
         if (was.identity, was.settings) != (info.identity, info.settings):
             stretches.append((info, []))
-        stretches[-1][1].append(columns(frames, imu_units))
+        stretches[-1][1].append(frames)
         if in_force.lost:
             lost[len(stretches) - 1] = in_force.lost
     longest = max(range(len(stretches)), key=lambda number: sum(map(len, stretches[number][1])))
