@@ -134,6 +134,9 @@ def test_a_long_interruption_has_no_more_rows_than_the_limit(tmp_path: Path) -> 
     made = samples(tmp_path / "run.mcap", frames, 100)
     assert len(made["valid"]) == 10_100
     assert made["sequence"][[4999, 5000, 5099, 5100]].tolist() == [4999, 5000, 5099, 10**9]
+    assert made["monotonic_ns"][[4999, 5000, 5099, 5100]].tolist() == [
+        number * PERIOD_NS for number in (4999, 5000, 5099, 10**9)
+    ]
 
 
 def test_the_rows_are_those_of_the_windows(tmp_path: Path) -> None:
