@@ -19,7 +19,7 @@ from bota_clients.export.samples import samples_of
 from bota_clients.export.windows import Arrays, Windows
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
-from tests.clients.recordings import PERIOD_NS, START_NS, frame, record
+from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, write
 from tests.clients.simulated import simulate
 from tests.clients.test_export_windows import NOT_FINITE, SETTINGS, TOOL, joined, stamps, tared
 from tests.descriptions import sensor_row
@@ -128,12 +128,31 @@ def test_stamps_of_lost_samples_are_between_their_neighbors_also_from_block_to_b
     assert np.flatnonzero(~made["valid"]).tolist() == [before, before + 1, before + 2]
 
 
+def test_where_events_come_just_after_a_gap_each_sample_is_in_its_row(tmp_path: Path) -> None:
+    """Of a block there may be lost samples only then: a tool's doubt ends within the gap."""
+    items: list[Any] = [describe(0, **SETTINGS), *(frame(number) for number in range(10))]
+    for number in range(410, 440):
+        items.append({"event": "offset_changed", "sensor": 0, "offset": [float(number), 0, 0, 0, 0, 0]})
+        items.append(frame(number, flags=GAP * (number == 410)))
+    write(path := tmp_path / "run.mcap", items)
+    tool = {"tool_mass": 0.0, "tool_center_of_gravity": [0, 0, 0]}
+    with open_recording(path) as recording:
+        made = joined(samples_of(recording, Windows(1000, tool=tool)))
+    assert made["monotonic_ns"].tolist() == [number * PERIOD_NS for number in range(440)]
+    assert np.flatnonzero(made["valid"]).tolist() == [*range(10), *range(410, 440)]
+    assert made["force_x_N"][made["valid"]].tolist() == [*range(10), *range(410, 440)]
+    assert made["time_s"] == pytest.approx(np.arange(440) * PERIOD_NS * 1e-9)
+
+
 def test_a_long_interruption_has_no_more_rows_than_the_limit(tmp_path: Path) -> None:
     frames = [frame(number) for number in range(5000)]
     frames += [frame(number, flags=GAP) for number in range(10**9, 10**9 + 5000)]
     made = samples(tmp_path / "run.mcap", frames, 100)
     assert len(made["valid"]) == 10_100
     assert made["sequence"][[4999, 5000, 5099, 5100]].tolist() == [4999, 5000, 5099, 10**9]
+    assert made["monotonic_ns"][[4999, 5000, 5099, 5100]].tolist() == [
+        number * PERIOD_NS for number in (4999, 5000, 5099, 10**9)
+    ]
 
 
 def test_the_rows_are_those_of_the_windows(tmp_path: Path) -> None:

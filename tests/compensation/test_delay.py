@@ -175,3 +175,14 @@ def test_a_lag_that_changes_has_a_wide_interval() -> None:
     shifted = felt.times - 0.002 * np.sin(0.2 * np.pi * felt.times)
     force = np.stack([np.interp(shifted, felt.times, axis) for axis in felt.force.T], axis=1)
     assert 0.8e-3 < lag_of(felt._replace(force=force)).interval_s < 2e-3
+
+
+def test_what_is_left_of_a_part_is_by_the_tool_of_the_other_parts() -> None:
+    """One eighth is of a tool that is twice as heavy."""
+    draw = np.random.default_rng([SEED, 9]).normal(size=(8000, 6))
+    imu = np.stack([np.convolve(column, np.hanning(160) / 10, "same") for column in draw.T], axis=1)
+    force = imu[:, :3] * np.where(np.arange(8000) < 1000, 2.0, 1.0)[:, np.newaxis]
+    samples = np.concatenate([force, imu], axis=1)
+    _, left = check_held_out(np.arange(8000) / 800.0, samples, {}, Lag(0.0, 1e-4, 1.0))
+    size = float(np.sqrt((imu[:, :3] ** 2).sum(axis=1).mean()))
+    assert left / size == pytest.approx(np.sqrt((1.0 + 7.0 * (1.0 / 7.0) ** 2) / 8.0), rel=0.08)

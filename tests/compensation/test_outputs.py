@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bota_ethercat.pdo import Vector3
-from bota_ft_compensation.outputs import WrenchFilter, WrenchTransform, low_pass
+from bota_ft_compensation.outputs import WrenchFilter, WrenchTransform, cutoff_problem, low_pass
 from bota_ft_compensation.quantities import ZERO, Quaternion
 
 RATE_HZ = 800.0
@@ -185,3 +185,10 @@ def test_after_which_pause_the_low_pass_begins_anew(
         made.step((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10**9)
         found = made.step((8.0, 0.0, 0.0), (0.0, 0.0, 0.0), 10**9 + passed_ns)
         assert (found.force[0] == pytest.approx(8.0)) is is_anew
+
+
+def test_a_cut_off_is_below_half_of_the_sampling_rate() -> None:
+    assert not cutoff_problem(399.99, 800.0)
+    assert cutoff_problem(400.0, 800.0) == (
+        "filter.cutoff is 400 Hz, but must be below half of the sampling rate, 400 Hz: lower it"
+    )
