@@ -162,10 +162,10 @@ def monitor(stream: Stream, _: Path) -> Iterator[tuple[int, Found]]:
 def report(stream: Stream, folder: Path) -> Iterator[tuple[int, Found]]:
     """Of the longest stretch without a change."""
     subject, *_ = of_recording(recorded(stream, folder / "run.mcap"), ImuUnits.G_DPS)
-    series = Series(subject)
-    usable = np.asarray(series.usable[:, :6].all(axis=1)).tolist()
-    for stamp, is_usable in zip(series.samples.stamp_ns.tolist(), usable, strict=True):
-        yield stamp, Found(None if is_usable else -1)
+    for part, samples in zip(subject.parts, Series(subject).read(), strict=True):
+        usable = np.asarray(samples.usable[:, :6].all(axis=1)).tolist()
+        for stamp, is_usable in zip(part.stamp_ns[part.fresh].tolist(), usable, strict=True):
+            yield stamp, Found(None if is_usable else -1)
 
 
 class Playing(Server):

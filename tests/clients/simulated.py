@@ -10,7 +10,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bota_clients.recording.columns import columns
+from bota_clients.recording.columns import Columns, columns
 from bota_clients.report.series import Subject
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.replies import SensorInfo
@@ -56,7 +56,13 @@ def subject_of(
 ) -> Subject:
     info = SensorInfo.parse(row)
     assert info is not None
-    return Subject(info, columns(frames), source)
+    return Subject(info, [columns(frames)], source)
+
+
+def whole(subject: Subject) -> Columns:
+    """Its frames."""
+    (found,) = subject.parts
+    return found
 
 
 def sensor(seconds: float, *commands: str, **options: Any) -> Subject:

@@ -19,7 +19,7 @@ from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.health.limits import Level
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from ethercat_server.virtual_sensor.signals import poses
-from tests.clients.simulated import sensor, simulate, subject_of
+from tests.clients.simulated import sensor, simulate, subject_of, whole
 from tests.descriptions import sensor_row
 from tests.simulation import more_if_long
 from tests.virtual_sensor.motions import measured, turning
@@ -59,7 +59,7 @@ def with_settings(given: Subject, settings: Mapping[str, Any] | None = None, **i
 
 
 def changed(given: Subject, **columns: Any) -> Subject:
-    return replace(given, columns=replace(given.columns, **columns))
+    return replace(given, parts=[replace(whole(given), **columns)])
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_the_noise_is_that_of_the_sensor_whatever_it_does(healthy: Subject) -> N
     source = measured(sinc=SINC, noise=True)
     readings = np.array([source.reading(n, 0, 0.0).values[:6] for n in range(2000)])
     assert examination.noise.deviation[:6] == pytest.approx(readings.std(axis=0), rel=0.06)
-    assert np.ptp(healthy.columns.force[:, 2]) > 20 * examination.noise.deviation[2], "there was a contact"
+    assert np.ptp(whole(healthy).force[:, 2]) > 20 * examination.noise.deviation[2], "there was a contact"
 
 
 # Faults that the virtual sensor can have.
@@ -222,7 +222,7 @@ def test_the_time_without_a_connection_is_not_in_the_sampling_rate(frames: tuple
     kept = [*frames[:1000], *renumbered(frames[1800:])]
     series = Examination(subject_of(kept, ROW)).series
     assert 1 / series.mean_period == pytest.approx(1 / series.period, rel=1e-3)
-    assert series.intervals.max() == pytest.approx(801 * series.period, rel=0.01)
+    assert series.duration == pytest.approx(SECONDS, rel=0.01)
 
 
 @pytest.mark.parametrize("flag", [DataFlag.INVALID, DataFlag.REPEATED])
@@ -236,7 +236,7 @@ def test_one_frame_of_a_silence_hides_no_loss(
     series = expect(subject_of(kept, ROW), {"Lost samples": (TROUBLE, ""), SILENT: (LOOK, "")}).series
     assert series.lost == pytest.approx(399, abs=2)
     assert series.withheld == (pytest.approx(series.lost, abs=2) if withheld else 0)
-    assert series.silences.max() < 0.01
+    assert series.longest_silence < 0.01
 
 
 def test_a_sensor_that_is_lost_is_looked_after_less_often_and_that_is_no_loss(
@@ -245,11 +245,11 @@ def test_a_sensor_that_is_lost_is_looked_after_less_often_and_that_is_no_loss(
     kept = flagged(frames, DataFlag.INVALID, range(2000, 2500))
     kept = [frame for n, frame in enumerate(kept) if not 2010 <= n < 2490 or n % 33 == 0]
     series = expect(subject_of(renumbered(kept), ROW), {SILENT: (TROUBLE, "")}).series
-    assert series.silences.max() == pytest.approx(1.25, abs=0.01)
+    assert series.longest_silence == pytest.approx(1.25, abs=0.01)
 
 
 def test_a_wall_clock_that_was_set_and_stamps_that_go_back_are_found(healthy: Subject) -> None:
-    c, later = healthy.columns, np.arange(len(healthy.columns)) >= 2000
+    c, later = whole(healthy), np.arange(len(whole(healthy))) >= 2000
     set_forward = changed(healthy, stamp_ns=c.stamp_ns + 2_500_000_000 * later)
     expect(set_forward, {"Stamps": (LOOK, "adjusted 1 time, by up to 2.50 s")})
     back = Examination(changed(healthy, monotonic_ns=c.monotonic_ns - 2_500_000_000 * later))
@@ -257,7 +257,7 @@ def test_a_wall_clock_that_was_set_and_stamps_that_go_back_are_found(healthy: Su
 
 
 def test_late_stamps_are_uneven_and_no_losses(healthy: Subject) -> None:
-    c = healthy.columns
+    c = whole(healthy)
     jitter = np.random.default_rng(1).choice([0, 0, 0, 1, 2], len(c)) * 600_000
     late = changed(healthy, monotonic_ns=c.monotonic_ns + jitter, stamp_ns=c.stamp_ns + jitter)
     assert expect(late, {"Stamps": (LOOK, "95 % of the intervals")}).series.lost == 0
@@ -278,7 +278,7 @@ def test_without_settings_nothing_is_called_healthy(healthy: Subject) -> None:
 
 
 def test_an_imu_that_is_off_is_no_reason_not_to_be_healthy(healthy: Subject) -> None:
-    nothing = np.zeros((len(healthy.columns), 3))
+    nothing = np.zeros((len(whole(healthy)), 3))
     constant = changed(healthy, acceleration=nothing, angular_rate=nothing)
     off = with_settings(constant, {**healthy.settings, "imu_active": 0})
     assert "Not applicable: noise of the IMU, gravity" in expect(off).sentence
@@ -291,21 +291,21 @@ def test_an_imu_that_is_off_is_no_reason_not_to_be_healthy(healthy: Subject) -> 
 )
 def test_an_accelerometer_in_the_wrong_unit_is_told(healthy: Subject, scale: float, words: str) -> None:
     check = check_of(
-        Examination(changed(healthy, acceleration=healthy.columns.acceleration * scale)), "Gravity"
+        Examination(changed(healthy, acceleration=whole(healthy).acceleration * scale)), "Gravity"
     )
     assert (check.level, words in check.remedy) == (LOOK, True)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_values_that_are_no_numbers_are_found_and_spoil_nothing_else(healthy: Subject, value: float) -> None:
-    force = healthy.columns.force.copy()
+    force = whole(healthy).force.copy()
     force[100:110, 1] = value
     expect(changed(healthy, force=force), {"Numbers": (TROUBLE, "^Samples have values that")})
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 50, 400])
 def test_too_little_is_not_conclusive(healthy: Subject, count: int) -> None:
-    short = replace(healthy, columns=healthy.columns.where(np.arange(len(healthy.columns)) < count))
+    short = replace(healthy, parts=[whole(healthy).where(slice(count))])
     examination = Examination(short)
     assert examination.headline == "Not conclusive"
     assert TROUBLE not in {check.level for check in examination.checks}

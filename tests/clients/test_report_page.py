@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from bota_clients.numbers import figure, seconds
-from bota_clients.recording.columns import Columns, Floats, columns
+from bota_clients.recording.columns import Columns, Floats
 from bota_clients.report import page as page_module
 from bota_clients.report.checks import Examination
 from bota_clients.report.page import as_json, render
-from bota_clients.report.plots import envelope, stretches
-from bota_clients.report.series import GROUPS
+from bota_clients.report.plots import stretches
+from bota_clients.report.series import GROUPS, Envelope
 from bota_ethercat.framing import DataFlag
-from tests.clients.simulated import sensor, simulate, subject_of
+from tests.clients.simulated import sensor, simulate, subject_of, whole
 from tests.descriptions import sensor_row
 from tests.simulation import more_if_long
 
@@ -126,7 +126,7 @@ def two() -> tuple[str, str]:
     first = subject_of(simulate(1), row, source=EVIL)
     examined = [
         Examination(first),
-        Examination(replace(first, info=first.info._replace(sensor=1, serial=9), columns=columns([]))),
+        Examination(replace(first, info=first.info._replace(sensor=1, serial=9), parts=[])),
     ]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_module, "GROUPS", GROUPS[:2])  # the others are drawn alike
@@ -166,7 +166,7 @@ def test_nonsense_is_examined_and_drawn_without_an_error(
 ) -> None:
     monkeypatch.setattr(page_module, "GROUPS", GROUPS[:2])  # the others are drawn alike
     given = subject_of(simulate(3, sinc_length=128), sensor_row(sinc_length=128))
-    examination = Examination(replace(given, columns=replace(given.columns, **spoil(given.columns))))
+    examination = Examination(replace(given, parts=[replace(whole(given), **spoil(whole(given)))]))
     assert examination.headline != "Good"
     assert all(check.found.endswith(".") for check in examination.checks)
     page = render([examination], made=MADE, program="p")
@@ -183,13 +183,13 @@ def test_two_sensors_stand_on_one_page_also_one_that_sent_nothing(two: tuple[str
 
 
 def test_many_samples_make_no_larger_a_page() -> None:
-    tile, times = sensor(1).columns, 40
+    tile, times = whole(sensor(1)), 40
     many = {name: np.concatenate([getattr(tile, name)] * times) for name in Columns.__slots__}
     shift = np.repeat(np.arange(times) * (int(np.ptp(tile.monotonic_ns)) + 1_250_000), len(tile))
     many["monotonic_ns"], many["stamp_ns"] = many["monotonic_ns"] + shift, many["stamp_ns"] + shift
     many["sequence"] = np.arange(len(shift))
     many["force"][12345, 2] = 77.0
-    examination = Examination(replace(sensor(0.1), columns=Columns(**many)))
+    examination = Examination(replace(sensor(0.1), parts=[Columns(**many)]))
     assert examination.series.count > 30_000
     long = render([examination], made=MADE, program="p")
     assert len(long) < LARGEST
@@ -201,16 +201,19 @@ def test_a_spike_is_never_averaged_away() -> None:
     time: Floats = np.linspace(0.0, 99.999, 100_000)
     values = np.zeros(100_000)
     values[31_415], values[27_182] = 5.0, np.nan
-    middles, low, high, mean = envelope(time, values, 100.0)
-    assert np.nanmax(high) == 5.0
-    assert high[int(31.415 / 100 * len(middles))] == 5.0
-    assert np.nanmin(low) == 0.0
-    assert 0 < np.nanmax(mean) < 0.1
+    found = Envelope(100.0, 1)
+    for part in np.array_split(np.arange(100_000), 7):
+        found.add(time[part], values[part, np.newaxis])
+    assert np.nanmax(found.high) == 5.0
+    assert found.high[int(31.415 / 100 * len(found.middles))] == 5.0
+    assert np.nanmin(found.low) == 0.0
+    assert 0 < np.nanmax(found.mean) < 0.1
 
 
 def test_stretches_join_neighbours() -> None:
-    assert stretches(np.array([]), 10.0, 10).shape == (0, 2)
-    assert stretches(np.array([0.5, 1.5, 1.6, 5.5, 99.0]), 10.0, 10).tolist() == [[0, 2], [5, 6], [9, 10]]
+    assert stretches(np.zeros(10, bool), 10.0).shape == (0, 2)
+    marked = np.isin(np.arange(10), [0, 1, 5, 9])
+    assert stretches(marked, 10.0).tolist() == [[0, 2], [5, 6], [9, 10]]
 
 
 def test_figures_and_spans_of_time() -> None:

@@ -18,13 +18,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Collection, Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 
 from bota_clients.numbers import count, figure, listing, seconds
 from bota_clients.recording.columns import Bools, Floats, Ints
-from bota_clients.report.series import CHANNELS, Series, Subject, bits, channel_limit
+from bota_clients.report.series import CHANNELS, Samples, Series, Subject, channel_limit
 from bota_ethercat.health.judge import SATURATIONS, Observation, judge
 from bota_ethercat.health.limits import LIMITS, Level
 from bota_ethercat.pdo import STANDARD_GRAVITY
@@ -37,6 +37,8 @@ _ORDER: Final = 3
 _NOISY: Final = 1.5
 _CONTACT_S: Final = 0.1  # a contact builds up in no less, which second differences of slow samples show, too
 _TO_DEVIATION: Final = 1.4826 / math.sqrt(6)  # median size of second differences of white noise to its std
+_MOST_WINDOWS: Final = 8192  # remembered: those of an hour, and one of some of a longer recording
+_LONGEST_WINDOW: Final = 1 << 18  # samples, of a clock that stands
 _FILLED: Final = 0.8  # share of its samples that a window must have
 
 
@@ -57,35 +59,118 @@ class Noise(NamedTuple):
         return bool(_shaken(self.deviation, self.limit))
 
 
-def _measure_noise(series: Series) -> Noise:
-    length = max(_WINDOW_S, _FEWEST_SAMPLES * series.period)
-    limit = _limits(series)
-    usable = series.usable
-    number = np.floor(series.time / length).astype(np.int64)
-    # A clock that jumps back must not join samples that are far apart.
-    edges = [0, *(np.flatnonzero(np.diff(number) != 0) + 1), series.count]
-    fewest = max(_FEWEST_SAMPLES // 2, int(_FILLED * length / series.period))
-    kept = [slice(*ends) for ends in itertools.pairwise(edges) if ends[1] - ends[0] >= fewest]
-    if len(kept) < _FEWEST_WINDOWS:
+class _Windows:
+    """Measures noise in the windows of samples, which come in time."""
+
+    def __init__(self, series: Series) -> None:
+        self._series, self._limit = series, _limits(series)
+        self._length = max(_WINDOW_S, _FEWEST_SAMPLES * series.period)
+        self._fewest = max(_FEWEST_SAMPLES // 2, int(_FILLED * self._length / series.period))
+        self._rest = np.zeros((0, 1 + 2 * len(CHANNELS)))  # of the window that goes on: time, values, usable
+        self._count = 0
+        self._every = 1  # one of so many windows is remembered
+        self._kept = list[Floats]()  # (2, 12): deviation, range
+        self._noisy, self._worst = np.zeros(len(CHANNELS), np.int64), np.zeros(len(CHANNELS))
+
+    def add(self, samples: Samples | None) -> None:
+        """None: the end."""
+        table = self._rest
+        if samples is not None:
+            new = np.column_stack([samples.time, samples.values, samples.usable])
+            table = np.concatenate([table, new])
+        number = np.floor(table[:, 0] / self._length).astype(np.int64)
+        # A clock that jumps back must not join samples that are far apart.
+        edges = [0, *(np.flatnonzero(np.diff(number) != 0) + 1).tolist()]
+        if samples is None or len(table) - edges[-1] > _LONGEST_WINDOW:
+            edges.append(len(table))
+        for begin, end in itertools.pairwise(edges):
+            if end - begin >= self._fewest:
+                self._measure(table[begin:end])
+        self._rest = table[edges[-1] :]
+
+    def _measure(self, rows: Floats) -> None:
+        time, values, usable = rows[:, 0], rows[:, 1 : 1 + len(CHANNELS)], rows[:, 1 + len(CHANNELS) :] != 0
+        deviation, reach, rough = _window(time, values, usable)
+        if _shaken(deviation, self._limit):
+            rough = np.full(len(CHANNELS), np.nan)
+        touched = reach * (self._series.period / _CONTACT_S) ** 2
+        noisy = rough > self._limit * max(_NOISY, 1 + 5 / math.sqrt(len(time))) + touched
+        self._noisy += noisy
+        self._worst = np.fmax(self._worst, np.where(noisy, rough, 0.0))
+        if self._count % self._every == 0:
+            self._kept.append(np.array([deviation, reach]))
+            if len(self._kept) > _MOST_WINDOWS:
+                self._kept, self._every = self._kept[::2], 2 * self._every
+        self._count += 1
+
+    def noise(self) -> Noise:
         unknown = np.full(len(CHANNELS), np.nan)
-        return Noise(unknown, limit, len(kept), 0, length, np.zeros(len(CHANNELS), np.int64), unknown)
-    windows = [_window(series.time[part], series.values[part], usable[part]) for part in kept]
-    deviations, ranges, roughs = np.array(windows).transpose(1, 0, 2)
-    # A window in which a channel is unusable counts as the least calm.
-    reaches = np.where(np.isfinite(ranges), ranges, np.inf)[:, :6]
-    usual = np.median(reaches, axis=0)
-    known = (usual > 0) & np.isfinite(usual)
-    unrest = (reaches[:, known] / usual[known]).max(axis=1, initial=0.0)
-    calm = deviations[np.argsort(unrest, kind="stable")[: max(_FEWEST_WINDOWS, len(unrest) // 2)]]
-    measured = np.sum(np.isfinite(calm), axis=0) >= _FEWEST_WINDOWS // 2
-    deviation = np.full(len(CHANNELS), np.nan)
-    deviation[measured] = np.nanmedian(calm[:, measured], axis=0)
-    rough = np.where(_shaken(deviations, limit)[:, None], np.nan, roughs)
-    sizes = np.array([part.stop - part.start for part in kept])
-    touched = ranges * (series.period / _CONTACT_S) ** 2
-    noisy = rough > limit * np.maximum(_NOISY, 1 + 5 / np.sqrt(sizes))[:, None] + touched
-    worst = np.where(noisy, rough, 0.0).max(axis=0)
-    return Noise(deviation, limit, len(kept), len(calm), length, noisy.sum(axis=0), worst)
+        if self._count < _FEWEST_WINDOWS:
+            nothing = np.zeros(len(CHANNELS), np.int64)
+            return Noise(unknown, self._limit, self._count, 0, self._length, nothing, unknown)
+        deviations, ranges = np.array(self._kept).transpose(1, 0, 2)
+        # A window in which a channel is unusable counts as the least calm.
+        reaches = np.where(np.isfinite(ranges), ranges, np.inf)[:, :6]
+        usual = np.median(reaches, axis=0)
+        known = (usual > 0) & np.isfinite(usual)
+        unrest = (reaches[:, known] / usual[known]).max(axis=1, initial=0.0)
+        calm = deviations[np.argsort(unrest, kind="stable")[: max(_FEWEST_WINDOWS, len(unrest) // 2)]]
+        measured = np.sum(np.isfinite(calm), axis=0) >= _FEWEST_WINDOWS // 2
+        deviation = unknown
+        deviation[measured] = np.nanmedian(calm[:, measured], axis=0)
+        used = max(_FEWEST_WINDOWS, self._count // 2)
+        return Noise(deviation, self._limit, self._count, used, self._length, self._noisy, self._worst)
+
+
+class Run(NamedTuple):
+    """Samples of a channel in a row with the same value."""
+
+    value: float
+    begin_s: float
+    end_s: float
+    samples: int
+
+    @property
+    def seconds(self) -> float:
+        return self.end_s - self.begin_s
+
+
+class _Runs:
+    """Finds the longest run of each channel."""
+
+    def __init__(self) -> None:
+        nothing = Run(math.nan, 0.0, -1.0, 0)
+        self.longest, self._last = [nothing] * len(CHANNELS), [nothing] * len(CHANNELS)
+        self._is_usable = np.zeros(len(CHANNELS), bool)
+
+    def add(self, samples: Samples) -> None:
+        if not len(samples.time):
+            return
+        usable, values, time = samples.usable, samples.values, samples.time
+        # Values that are saturated or not finite belong to other checks: each is a run of its own.
+        apart = ~usable | ~np.concatenate([self._is_usable[np.newaxis], usable[:-1]])
+        before = np.concatenate([[[run.value for run in self._last]], values[:-1]])
+        changed = (values != before) | apart | (samples.interval_ns <= 0)[:, np.newaxis]
+        for channel in range(len(CHANNELS)):
+            starts = np.append(np.flatnonzero(changed[:, channel]), len(time))
+            value = values[:, channel]
+            last = self._last[channel]
+            if starts[0]:  # it goes on
+                at = int(starts[0])
+                last = last._replace(end_s=float(time[at - 1]), samples=last.samples + at)
+            self._note(channel, last)
+            if len(starts) > 1:
+                spans = time[starts[1:] - 1] - time[starts[:-1]]
+                for run in (int(np.argmax(spans)), len(spans) - 1):
+                    begin, end = starts[run : run + 2].tolist()
+                    last = Run(float(value[begin]), float(time[begin]), float(time[end - 1]), end - begin)
+                    self._note(channel, last)
+            self._last[channel] = last
+        self._is_usable = usable[-1]
+
+    def _note(self, channel: int, run: Run) -> None:
+        if run.seconds > self.longest[channel].seconds:
+            self.longest[channel] = run
 
 
 def _shaken(deviation: Floats, limit: Floats) -> Bools:
@@ -133,7 +218,12 @@ class Examination:
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
         self.series = Series(subject)
-        self.noise = _measure_noise(self.series)
+        windows, runs = _Windows(self.series), _Runs()
+        for samples in self.series.read():
+            windows.add(samples)
+            runs.add(samples)
+        windows.add(None)
+        self.noise, self.runs = windows.noise(), runs.longest
         # Of the judge of all programs; the checks beyond it are this report's own.
         self.stream = judge(_observe(self.series))
         self.checks = [check for each in _CHECKS if (check := _made(each, self)) is not None]
@@ -173,7 +263,7 @@ class _Kind(NamedTuple):
     keys: Collection[str]  # of the findings of the judge of streams that belong to it
     fewest: int  # samples that it needs
     # Adds to what the judge found, or checks by itself.
-    make: Callable[[Series, Noise], Check] | None
+    make: Callable[[Examination], Check] | None
     matters: str = ""  # why it matters if something is found
     remedy: str = ""
     good: str = ""  # the outcome if nothing is found; "": then there is no such check, or `make` has it
@@ -189,7 +279,7 @@ def _made(kind: _Kind, examination: Examination) -> Check | None:
     elif kind.make is None:
         result = Check("" if findings else kind.good)
     else:
-        result = kind.make(series, examination.noise)
+        result = kind.make(examination)
     level = max([result.level, *(finding.level for finding in findings)])
     found = " ".join([*(f"{finding.found}." for finding in findings), result.found]).rstrip()
     is_wrong = level >= Level.LOOK
@@ -207,24 +297,26 @@ def _too_few(samples: int) -> Check:
     return _not_possible(found if samples else "There are no samples.", "Record for at least 10 s.")
 
 
-def _stamps(series: Series, _: Noise) -> Check:
-    off = [max(each, 1e-7) for each in (series.usual_deviation, np.abs(series.deviations).max(initial=0.0))]
+def _stamps(examined: Examination) -> Check:
+    series = examined.series
+    off = [max(each, 1e-7) for each in (series.usual_deviation, *series.deviations[3:])]
     found = [
         f"95 % of the intervals are within {seconds(off[0])} of {seconds(series.period)}, all within "
-        f"{seconds(off[1])}."
+        f"{seconds(off[-1])}."
     ]
     remedies = []
-    if backwards := int(np.sum(series.intervals <= 0)):
-        found.append(f"{count(backwards, 'stamp')} not later than the one before.")
+    if series.backwards:
+        found.append(f"{count(series.backwards, 'stamp')} not later than the one before.")
         remedies.append("Was the server's machine restarted? Record without interruption.")
-    if len(steps := series.clock_steps):
-        biggest = figure(max(steps, key=abs))
-        found.append(f"The system clock was adjusted {count(len(steps), 'time')}, by up to {biggest} s.")
+    if series.clock_steps:
+        times, biggest = count(series.clock_steps, "time"), figure(series.largest_step)
+        found.append(f"The system clock was adjusted {times}, by up to {biggest} s.")
         remedies.append("Wait for chrony or NTP to converge before recording.")
     return Check(" ".join(found), Level.LOOK if remedies else Level.GOOD, " ".join(remedies))
 
 
-def _rate(series: Series, _: Noise) -> Check:
+def _rate(examined: Examination) -> Check:
+    series = examined.series
     if series.nominal_period is None:
         return _not_possible("Neither settings nor rate are known.", "Record the settings too.")
     rate, wanted = 1 / series.mean_period, 1 / series.nominal_period
@@ -232,7 +324,8 @@ def _rate(series: Series, _: Noise) -> Check:
     return Check(f"{rate:.3f} Hz; the settings say {wanted:.3f} Hz ({ppm:+.0f} ppm).")
 
 
-def _force_torque(series: Series, noise: Noise) -> Check:
+def _force_torque(examined: Examination) -> Check:
+    series = examined.series
     if series.subject.sinc_length is None:
         found = "The SINC length is not known, so no limit is known."
         return _not_possible(found, "Record the settings too.")
@@ -241,13 +334,13 @@ def _force_torque(series: Series, noise: Noise) -> Check:
             "Force and torque are raw counts (the calibration matrix is off), and the limits are in N and Nm."
         )
         return _not_possible(found, "Enable calibration_matrix and record again.")
-    return _noise(noise, range(6))
+    return _noise(examined.noise, range(6))
 
 
-def _imu(series: Series, noise: Noise) -> Check:
-    if series.imu_off:
+def _imu(examined: Examination) -> Check:
+    if examined.series.imu_off:
         return Check("The IMU is off.", level=Level.NOT_APPLICABLE)
-    return _noise(noise, range(6, 12))
+    return _noise(examined.noise, range(6, 12))
 
 
 _VERY_NOISY: Final = 4.0  # times the limit
@@ -295,29 +388,23 @@ _WHOLE: Final = 0.9  # a channel that is constant for this share of a short reco
 _SHORTEST_S: Final = 1.0  # shorter recordings say nothing about the IMU
 
 
-def _stuck(series: Series, _: Noise) -> Check:
+def _stuck(examined: Examination) -> Check:
+    series = examined.series
     if series.duration < _SHORTEST_S:
         found = f"The recording is only {seconds(series.duration)} long."
         return _not_possible(found, "Record for at least 10 s.")
     imu_longest_s = min(_IMU_LONGEST_S, max(_WHOLE * series.duration, _SHORTEST_S))
     stuck, longest = [], 0
-    for n, (channel, values) in enumerate(zip(CHANNELS, series.values.T, strict=True)):
-        # Values that are saturated or not finite belong to other checks: each is a run of its own.
-        apart = ~series.usable[:, n]
-        changed = (values[1:] != values[:-1]) | apart[1:] | apart[:-1] | (series.intervals <= 0)
-        starts = np.append(0, np.flatnonzero(changed) + 1)
-        ends = np.append(starts[1:], series.count) - 1
-        spans = series.time[ends] - series.time[starts]
-        run = int(np.argmax(spans))
-        begin, samples, span = starts[run], int(ends[run] - starts[run] + 1), spans[run]
+    for channel, run in zip(CHANNELS, examined.runs, strict=True):
+        span, samples = run.seconds, run.samples
         if channel.group.is_imu:
             is_stuck = span > imu_longest_s and not series.imu_off
         else:
             is_stuck, longest = samples > _LONGEST_SAMPLES and span > _LONGEST_S, max(longest, samples)
         if is_stuck:
             stuck.append(
-                f"{channel.title} was constant at {figure(values[begin], 5)} {channel.group.unit} for "
-                f"{seconds(span)} ({samples} samples) from {seconds(series.time[begin])} on"
+                f"{channel.title} was constant at {figure(run.value, 5)} {channel.group.unit} for "
+                f"{seconds(span)} ({samples} samples) from {seconds(run.begin_s)} on"
             )
     if stuck:
         return Check(f"{listing(stuck)}.", Level.TROUBLE)
@@ -328,13 +415,12 @@ def _stuck(series: Series, _: Noise) -> Check:
 _GRAVITY_TOLERANCE: Final = 1.0  # m/s²: an accelerometer's offset is well below it
 
 
-def _gravity(series: Series, _: Noise) -> Check:
-    if series.imu_off:
+def _gravity(examined: Examination) -> Check:
+    usual, g = examined.series.gravity, STANDARD_GRAVITY
+    if examined.series.imu_off:
         return Check("The IMU is off.", level=Level.NOT_APPLICABLE)
-    lengths = np.linalg.norm(series.samples.acceleration[series.finite[:, 6:9].all(axis=1)], axis=1)
-    if not len(lengths):
+    if usual is None:
         return _too_few(0)
-    usual, g = float(np.median(lengths)), STANDARD_GRAVITY
     found = f"The accelerometer measures {figure(usual)} m/s² (median of the norm); {g} is one g."
     if abs(usual - g) <= _GRAVITY_TOLERANCE:
         return Check(found)
@@ -346,9 +432,9 @@ def _gravity(series: Series, _: Noise) -> Check:
     return Check(found, Level.LOOK, remedy)
 
 
-def _temperature(series: Series, _: Noise) -> Check:
-    known = series.samples.temperature[np.isfinite(series.samples.temperature)]
-    return Check(f"{figure(known.min())} to {figure(known.max())} °C.") if len(known) else _too_few(0)
+def _temperature(examined: Examination) -> Check:
+    known = examined.series.temperatures
+    return Check(f"{figure(known[0])} to {figure(known[1])} °C.") if known else _too_few(0)
 
 
 _FEWEST: Final = 100  # samples to judge their intervals by
@@ -383,24 +469,20 @@ _CHECKS: Final = (
 
 def _observe(series: Series) -> Observation:
     """The whole stream."""
-    samples, counts, nominal = series.samples, series.counts, series.nominal_period
+    counts, nominal = series.counts, series.nominal_period
     judged = series.count >= _FEWEST
-    known = samples.temperature[np.isfinite(samples.temperature)]
-    coldest, hottest = (float(known.min()), float(known.max())) if len(known) else (0.0, None)
+    coldest, hottest = series.temperatures or (0.0, None)
     return Observation(
         seconds=series.duration,
         samples=series.count,
         lost=max(series.lost, counts.missing),
         repeated=counts.repeated,
         invalid=counts.invalid,
-        silent_s=float(series.silences.max(initial=0.0)),
+        silent_s=series.longest_silence,
         rate_hz=1 / series.mean_period if judged else None,
         nominal_hz=1 / nominal if nominal else 0.0,
-        not_finite=int(np.sum(series.not_finite)),
-        warnings=bits(samples.warnings),
-        force_torque_saturated=bits(samples.force_torque_saturated),
-        acceleration_saturated=bits(samples.acceleration_saturated),
-        angular_rate_saturated=bits(samples.angular_rate_saturated),
+        not_finite=series.not_finite,
+        **cast(Any, series.bits),
         temperature=coldest if coldest < LIMITS.coldest else hottest,
         locked=False if judged and series.is_irregular else None,
         lost_because=series.subject.lost_because,

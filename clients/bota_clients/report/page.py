@@ -14,7 +14,7 @@ from bota_clients import numbers
 from bota_clients.numbers import figure, share
 from bota_clients.report import plots
 from bota_clients.report.checks import Examination
-from bota_clients.report.series import CHANNELS, GROUPS, limit_origin
+from bota_clients.report.series import CHANNELS, DENSE, GROUPS, limit_origin
 from bota_ethercat.sensor.meaning import meaning, value_meaning
 from bota_ethercat.settings import SETTINGS
 from bota_ethercat.text.untrusted import printable, visible
@@ -34,7 +34,7 @@ _PAGE: Final = jinja2.Environment(
     lstrip_blocks=True,
 )
 _PAGE.filters |= {name: getattr(numbers, name) for name in ("count", "figure", "moment", "seconds", "share")}
-_PAGE.globals |= {"plots": plots, "GROUPS": GROUPS, "limit_origin": limit_origin}
+_PAGE.globals |= {"plots": plots, "DENSE": DENSE, "GROUPS": GROUPS, "limit_origin": limit_origin}
 
 
 def render(examinations: Sequence[Examination], *, made: str, program: str, note: str = "") -> str:
@@ -69,7 +69,7 @@ def _view(examination: Examination) -> dict[str, Any]:
         "noise_rows": _noise_rows(examination),
         "deviations": ", ".join(
             f"{figure(value * 1e6)} µs"
-            for value in np.quantile(np.abs(series.deviations), (0.5, 0.95, 0.999, 1))
+            for value in series.deviations
         ) if len(series.deviations) else "not known",
     }  # fmt: skip
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from bota_clients.numbers import figure as number
 from bota_clients.numbers import seconds
-from bota_clients.recording.columns import Floats, Ints
+from bota_clients.recording.columns import Bools, Floats
 from bota_clients.report.series import GROUPS, Group, Series
 
 # Those of the axes differ in lightness as well as in hue (after Okabe and Ito).
@@ -82,36 +82,10 @@ def _panels(figure: Figure, series: Series) -> list[Axes]:
     return panels
 
 
-BINS: Final = 640  # about the width of a page in points
-DENSE: Final = 2 * BINS  # more samples than this are drawn as an envelope
-
-
-def _bins(times: Floats, width: float, bins: int) -> Ints:
-    """In which of the `bins` of 0 to `width` each of the times is."""
-    index: Ints = np.clip((times / width * bins).astype(np.int64), 0, bins - 1)
-    return index
-
-
-def envelope(time: Floats, values: Floats, width: float, bins: int = BINS) -> tuple[Floats, ...]:
-    """Middle (s), minimum, maximum and mean of each bin of 0 to `width`; NaN in empty ones.
-
-    Of samples at `time` (s), which need not be in order; values that are not finite are ignored.
-    """
-    good = np.isfinite(values)
-    index, values = _bins(time[good], width, bins), values[good]
-    low, high = np.full((2, bins), np.nan)
-    np.fmin.at(low, index, values)
-    np.fmax.at(high, index, values)
-    counts = np.bincount(index, minlength=bins)
-    mean = np.bincount(index, values, bins) / np.where(counts, counts, np.nan)
-    return np.linspace(0, width, 2 * bins + 1)[1::2], low, high, mean
-
-
-def stretches(times: Floats, width: float, bins: int = BINS) -> Floats:
-    """(k, 2) where something happened at `times` (s): the bins of 0 to `width`, neighbours as one stretch."""
-    indices = np.unique(_bins(times, width, bins))
-    apart = np.diff(indices, prepend=-9) > 1, np.diff(indices, append=bins + 9) > 1
-    return np.multiply(np.column_stack([indices[apart[0]], indices[apart[1]] + 1]), width / bins)
+def stretches(bins: Bools, width: float) -> Floats:
+    """(k, 2) the marked bins of 0 to `width`, neighbours as one stretch."""
+    edges = np.flatnonzero(np.diff(bins, prepend=False, append=False))
+    return np.multiply(edges.reshape(-1, 2), width / len(bins))
 
 
 def _segments(panel: Axes, ends: Floats, heights: tuple[float, float], **style: Any) -> None:
@@ -123,39 +97,41 @@ def _segments(panel: Axes, ends: Floats, heights: tuple[float, float], **style: 
 def over_time(figure: Figure, series: Series, group: Group) -> str:
     """Three panels, x, y and z: mean and range of each bin; marks where it was saturated or lost samples."""
     texts = []
-    lost = stretches(series.time[1:][series.missing > 0], series.width).mean(axis=1, keepdims=True)
+    envelope, few = series.envelope, series.few
+    lost = stretches(series.lossy, series.width).mean(axis=1, keepdims=True)
     for axis, panel in enumerate(_panels(figure, series)):
         index = 3 * GROUPS.index(group) + axis
-        values, in_panel = series.values[:, index], panel.get_xaxis_transform()
+        low, high, in_panel = envelope.low[:, index], envelope.high[:, index], panel.get_xaxis_transform()
         panel.set_ylabel(f"{'xyz'[axis]}, {group.unit}")
-        finite = values[np.isfinite(values)]
-        if not len(finite):
+        known = np.isfinite(low)
+        if not known.any():
             panel.text(0.5, 0.5, "no data", transform=panel.transAxes, ha="center", color=MUTED)
-        elif series.count <= DENSE:
-            at = np.flatnonzero(series.broken) + 1  # where the line is interrupted
+        elif few:
+            times, rows, apart = zip(*few, strict=True)
+            at, values = np.flatnonzero(apart), np.array(rows)[:, index]  # where the line is interrupted
             values = np.where(np.isfinite(values), values, np.nan)
-            panel.plot(np.insert(series.time, at, np.nan), np.insert(values, at, np.nan), color=AXES[axis])
+            panel.plot(np.insert(times, at, np.nan), np.insert(values, at, np.nan), color=AXES[axis])
         else:
-            time, low, high, mean = envelope(series.time, values, series.width)
-            panel.fill_between(time, low, high, color=AXES[axis], alpha=0.35, linewidth=0.4)
-            panel.plot(time, mean, color=AXES[axis], linewidth=0.8)
-        saturated = stretches(series.time[series.saturated[:, index]], series.width)
+            panel.fill_between(envelope.middles, low, high, color=AXES[axis], alpha=0.35, linewidth=0.4)
+            panel.plot(envelope.middles, envelope.mean[:, index], color=AXES[axis], linewidth=0.8)
+        saturated = stretches(series.saturated[:, index], series.width)
         _segments(panel, saturated, (0.985, 0.985), color=BAD, linewidth=3, transform=in_panel)
         _segments(panel, np.tile(lost, 2), (0.0, 0.07), color=INK, linewidth=0.7, transform=in_panel)
-        if len(finite):
-            texts.append(f"{'xyz'[axis]} from {number(finite.min())} to {number(finite.max())}")
+        if known.any():
+            least, most = number(np.nanmin(low)), number(np.nanmax(high))
+            texts.append(f"{'xyz'[axis]} from {least} to {most}")
     return f"{group.title} in {group.unit} over {seconds(series.duration)}: {', '.join(texts) or 'nothing'}."
 
 
 def temperature(figure: Figure, series: Series) -> str:
     """The mean of each bin."""
-    time, low, high, mean = envelope(series.time, series.samples.temperature, series.width)
+    mean = series.envelope.mean[:, -1]
     known = np.isfinite(mean)
-    if not known.any():
+    if series.temperatures is None:
         return ""
     figure.set_figheight(2.0)
     _margins(figure)
     panel = figure.subplots()
-    panel.plot(time[known], mean[known], color=PLAIN)
+    panel.plot(series.envelope.middles[known], mean[known], color=PLAIN)
     panel.set(xlim=(0, series.width), xlabel="time, s", ylabel="°C")
-    return f"Temperature from {number(np.nanmin(low))} to {number(np.nanmax(high))} °C."
+    return f"Temperature from {number(series.temperatures[0])} to {number(series.temperatures[1])} °C."
