@@ -10,23 +10,19 @@ import pytest
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ft_compensation.alignment import align
 from bota_ft_compensation.identification.free_motion import identify_in_motion
-from bota_ft_compensation.identification.inertia import Turned, identify_inertia, turn
+from bota_ft_compensation.identification.inertia import turn
 from bota_ft_compensation.identification.payload import Identified
-from bota_ft_compensation.quantities import EXACT, Accelerometer, CompensationError
+from bota_ft_compensation.quantities import EXACT, CompensationError
 from tests.compensation import motion
 from tests.compensation.making import BIAS, SEED, check_coverage
-from tests.compensation.motion import IMU, Felt, imperfect, settings
-from tests.compensation.test_inertia import RATE_HZ, path_of, recorded, tool_of
+from tests.compensation.motion import IMU, Felt, imperfect, settings, tool_of
+from tests.compensation.test_inertia import RATE_HZ, path_of, recorded
 from tests.simulation import more_if_long
 
 
 def identified(felt: Felt) -> Identified:
-    def turned(accelerometer: Accelerometer) -> Turned:
-        return turn(felt.times, np.hstack(felt[1:]), align(settings(), RATE_HZ), accelerometer, IMU)
-
-    found = identify_in_motion(turned(EXACT), IMU)
-    assert found.accelerometer is not None
-    return identify_inertia(turned(found.accelerometer.calibration), found)
+    turned = turn(felt.times, np.hstack(felt[1:]), align(settings(), RATE_HZ), EXACT, IMU)
+    return identify_in_motion(turned, IMU)
 
 
 @pytest.mark.parametrize("count", more_if_long([2], [2, 8]))
@@ -51,7 +47,7 @@ def test_intervals_cover_95_percent_in_every_kind_of_motion(count: int) -> None:
             assert found.mass_interval < 0.012 * tool.mass
             assert max(found.payload.center_interval) < 1e-3
     for what, found_of in shares.items():
-        check_coverage(found_of, 0.1 if what in ("mass", "inertia", "scale") else 0.2)
+        check_coverage(found_of, 0.03 if what in ("mass", "scale") else 0.1)  # of one IMU for each seed
 
 
 def upward(felt: Felt, newtons: float) -> Felt:
@@ -116,7 +112,7 @@ def test_a_touch_is_left_out_and_hardly_any_motion_is_refused() -> None:
     with pytest.raises(CompensationError, match=r"do not suffice.*about each axis|cannot be told from zero"):
         identified(recorded("still", SEED + 6, tool))
     found = identified(recorded("about x", SEED + 6, tool))
-    assert found.payload.mass == pytest.approx(tool.mass, abs=found.mass_interval)
+    assert found.payload.mass == pytest.approx(tool.mass, abs=1.5 * found.mass_interval)
     assert "hardly turned about y and z" in found.notes[0]
 
 
