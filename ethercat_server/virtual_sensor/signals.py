@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
+from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.world import Felt
 
 # As the fields of the process data are named, in their order.
@@ -94,16 +95,22 @@ _SWINGS = ((0.5, 0.31), (0.45, 0.23), (0.6, 0.37))
 _SHAKE = ((0.15, 1.7), (0.10, 2.3), (0.20, 1.1))
 TOOL_MASS = 0.8  # kg
 TOOL_CENTRE: Vector3 = (0.004, -0.006, 0.055)  # center of gravity in the sensor's frame, m
+TOOL_INERTIA = (0.0022, 0.002, 0.0009, 0.0001, -0.0002, 0.0001)  # xx yy zz xy xz yz about it, kg m²
+_IMU: Final[Vector3] = (0.0, 0.0, IMU_HEIGHTS["SENS"])  # m
 CONTACT_POINT: Vector3 = (0.0, 0.0, 0.12)  # on the tool, m
 CONTACT_START, CONTACT_LENGTH, CONTACT_PERIOD = 5.0, 0.6, 7.0  # s: of the first; from one to the next
 CONTACT_FORCE: Vector3 = (3.0, -2.0, -12.0)  # at its peak, N, in the sensor's frame
 
 
-def sway(seconds: float) -> tuple[Vector3, Vector3]:
+Angles = tuple[Vector3, Vector3, Vector3]  # yaw, pitch and roll, rad, and their first and second derivatives
+
+
+def sway(seconds: float) -> Angles:
     """Never stationary: yaw, pitch and roll swing."""
     yaw, pitch, roll = (a * math.sin(w * seconds) for a, w in _SWINGS)
     yaw_rate, pitch_rate, roll_rate = (a * w * math.cos(w * seconds) for a, w in _SWINGS)
-    return (yaw, pitch, roll), (yaw_rate, pitch_rate, roll_rate)
+    yaw_spin, pitch_spin, roll_spin = (-w * w * a * math.sin(w * seconds) for a, w in _SWINGS)
+    return (yaw, pitch, roll), (yaw_rate, pitch_rate, roll_rate), (yaw_spin, pitch_spin, roll_spin)
 
 
 def contact_force(seconds: float) -> Vector3:
@@ -115,32 +122,54 @@ def contact_force(seconds: float) -> Vector3:
     return x * push, y * push, z * push
 
 
-def carry(attitude: Vector3, rates: Vector3, acceleration: Vector3 = (0.0, 0.0, 0.0)) -> Felt:
-    """What a sensor with the tool feels: `rates` are the attitude's derivatives, rad/s; acceleration, m/s².
+def carry(angles: Angles, acceleration: Vector3 = (0.0, 0.0, 0.0)) -> Felt:
+    """What a sensor with the tool feels whose wrench origin is accelerated, m/s², and which turns so.
 
-    Specific force f = R^T (a - g), so +1 g upward when stationary; tool force F = m R^T (g - a) = -m f;
-    torque r x F. The tool's own rotational inertia and the lever arm to the IMU are neglected.
+    A rigid body on a SensONE. Specific force f = R^T (a - g), so +1 g upward when stationary, and elsewhere
+    f + spin x r + rate x (rate x r); at the center of gravity it makes the force F = -m f, and the torque
+    r x F - (J spin + rate x J rate).
     """
+    attitude, (yaw1, pitch1, roll1), (yaw2, pitch2, roll2) = angles
     cy, sy, cp, sp, cr, sr = _cosines_and_sines(attitude)
-    yaw_rate, pitch_rate, roll_rate = rates
-    turning = (
-        roll_rate - yaw_rate * sp,
-        pitch_rate * cr + yaw_rate * cp * sr,
-        -pitch_rate * sr + yaw_rate * cp * cr,
+    rate = roll1 - yaw1 * sp, pitch1 * cr + yaw1 * cp * sr, -pitch1 * sr + yaw1 * cp * cr
+    spin = (
+        roll2 - yaw2 * sp - yaw1 * pitch1 * cp,
+        pitch2 * cr - pitch1 * roll1 * sr + yaw2 * cp * sr + yaw1 * (roll1 * cp * cr - pitch1 * sp * sr),
+        -pitch2 * sr - pitch1 * roll1 * cr + yaw2 * cp * cr - yaw1 * (roll1 * cp * sr + pitch1 * sp * cr),
     )
     x, y, z = acceleration
     z += STANDARD_GRAVITY
-    fx = cy * cp * x + sy * cp * y - sp * z
-    fy = (cy * sp * sr - sy * cr) * x + (sy * sp * sr + cy * cr) * y + cp * sr * z
-    fz = (cy * sp * cr + sy * sr) * x + (sy * sp * cr - cy * sr) * y + cp * cr * z
-    weight = (-TOOL_MASS * fx, -TOOL_MASS * fy, -TOOL_MASS * fz)
-    return Felt((*weight, *cross(TOOL_CENTRE, weight)), (fx, fy, fz), turning, attitude=attitude)
+    felt = (
+        cy * cp * x + sy * cp * y - sp * z,
+        (cy * sp * sr - sy * cr) * x + (sy * sp * sr + cy * cr) * y + cp * sr * z,
+        (cy * sp * cr + sy * sr) * x + (sy * sp * cr - cy * sr) * y + cp * cr * z,
+    )
+
+    def at(place: Vector3) -> Vector3:
+        turned, turning = cross(spin, place), cross(rate, cross(rate, place))
+        return (
+            felt[0] + turned[0] + turning[0],
+            felt[1] + turned[1] + turning[1],
+            felt[2] + turned[2] + turning[2],
+        )
+
+    fx, fy, fz = at(TOOL_CENTRE)
+    force = -TOOL_MASS * fx, -TOOL_MASS * fy, -TOOL_MASS * fz
+    parts = zip(cross(TOOL_CENTRE, force), _momentum(spin), cross(rate, _momentum(rate)), strict=True)
+    torque = tuple(held - spun - turned for held, spun, turned in parts)
+    return Felt((*force, *torque), at(_IMU), rate, attitude=attitude)
+
+
+def _momentum(rate: Vector3) -> Vector3:
+    """The tool's tensor times this."""
+    (x, y, z), (xx, yy, zz, xy, xz, yz) = rate, TOOL_INERTIA
+    return xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
 
 
 def scene(seconds: float) -> Felt:
     """A tool on a swaying wrist, which is accelerated, too, and touches something now and then."""
     ax, ay, az = (a * math.sin(w * seconds) for a, w in _SHAKE)
-    felt, contact = carry(*sway(seconds), (ax, ay, az)), contact_force(seconds)
+    felt, contact = carry(sway(seconds), (ax, ay, az)), contact_force(seconds)
     if not any(contact):
         return felt
     touched = (*contact, *cross(CONTACT_POINT, contact))
@@ -159,11 +188,18 @@ def poses(seconds: float) -> Felt:
     s = max(0.0, passed - POSE_LENGTH) / MOVE_LENGTH
     # Smooth from standstill to standstill.
     share, rate = s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * (1.0 - s) ** 2 / MOVE_LENGTH
-    (pitch, pitch_rate), (roll, roll_rate) = (
-        (math.pi / 2 * (a + share * (b - a)), math.pi / 2 * rate * (b - a))
-        for a, b in zip(here, following, strict=True)
+    spin = 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / MOVE_LENGTH**2
+    (pitch, roll), (pitch_begin, roll_begin) = (
+        (math.pi / 2 * (b - a) for a, b in zip(here, following, strict=True)),
+        (math.pi / 2 * a for a in here),
     )
-    return carry((0.0, pitch, roll), (0.0, pitch_rate, roll_rate))
+    return carry(
+        (
+            (0.0, pitch_begin + share * pitch, roll_begin + share * roll),
+            (0.0, rate * pitch, rate * roll),
+            (0.0, spin * pitch, spin * roll),
+        )
+    )
 
 
 SCENES: Final = {"scene": scene, "poses": poses}

@@ -42,6 +42,7 @@ from bota_ethercat_bridge.stream.link import (
     offset_text,
 )
 from bota_ft_compensation.bias import TareBasis, check_at_rest, estimate_bias
+from bota_ft_compensation.bounds import at_reference
 from bota_ft_compensation.identification.parameter_file import write_yaml
 from bota_ft_compensation.identification.payload import (
     Identified,
@@ -196,16 +197,16 @@ class BiasServices:
         bias = estimate_bias(means, payload, specific_force or ZERO).plus(target, -1.0)
         by_imu = specific_force is not None and window.source.is_imu
         accelerometer = control.parameters.accelerometer if by_imu else None
-        control.set_bias(bias, "tare", TareBasis(payload, specific_force, accelerometer))
+        spread = means.force_spread + means.torque_spread
+        noise = at_reference(spread, control.output.stream.in_force.info.settings)
+        control.set_bias(bias, "tare", TareBasis(payload, specific_force, accelerometer, noise))
         weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
         if not payload.mass:
             weight = (
                 "tool_mass is 0, so the weight of whatever hangs on the sensor is part of it and it holds in "
                 "this orientation only"
             )
-        spread, residual = means.force_spread + means.torque_spread, means.latest.plus(means.wrench, -1.0)
-        if control.output.contact:
-            control.output.contact.noise = spread
+        residual = means.latest.plus(means.wrench, -1.0)
         fields = {"bias": bias.values, "spread": spread, "residual": residual.values}
         return Done(f"bias of {means.samples} samples: {wrench_text(bias)}; {weight}", fields)
 
@@ -290,7 +291,8 @@ class IdentifyServices:
         if (result := self._result) is None:
             raise CompensationError("there is no result to apply: call identify/solve first")
         accelerometer = result.accelerometer.calibration if result.accelerometer else None
-        self._control.set_payload(result.payload, result.bias, accelerometer)
+        settings = self._control.output.stream.in_force.info.settings
+        self._control.set_payload(result.payload, result.bias, result.accuracy(settings), accelerometer)
         also = ", accelerometer.offset and accelerometer.scale" if accelerometer else ""
         return Done(
             f"in force: tool_mass {result.payload.mass:.4f} kg, its center of gravity, a likely tool_inertia "
@@ -323,7 +325,8 @@ class IdentifyServices:
         try:
             file = Path(path).expanduser()
             file.parent.mkdir(parents=True, exist_ok=True)
-            write_yaml(file, result, "\n".join(comment), control.parameters.gravity, control.offset)
+            settings = control.output.stream.in_force.info.settings
+            write_yaml(file, result, "\n".join(comment), control.parameters.gravity, control.offset, settings)
         except (FileError, OSError, RuntimeError) as error:
             if isinstance(error, RuntimeError):
                 error = RuntimeError(f"there is no home directory for {path}: give identify.file in full")

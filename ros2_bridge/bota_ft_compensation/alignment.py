@@ -31,10 +31,11 @@ from bota_ethercat.settings import SettingValue
 Array = NDArray[np.float64]
 
 _UNKNOWN_HZ: Final = 1600.0  # taken for a rate that is unknown: samples that are fewer are interpolated
-_HISTORY_S: Final = 0.014  # what precedes it tells no more
-# Motion that is expected beyond a line: rms, m/s² and rad/s, and Hz up to which its density is about
-# constant. Chosen by what is left of moves, polishing and vibration; the optimum is flat.
-_ACCELERATION, _RATE = (10.0, 9.0), (4.0, 1.5)
+_HISTORY_S: Final = 0.014, 0.025  # of acceleration and angular rate: what precedes it tells hardly more
+# Motion that is expected beyond a line: rms, m/s² and rad/s, Hz up to which its density is about constant,
+# and how steeply it falls. Chosen by what is left of moves, polishing and vibration; the optimum is flat.
+_Motion = tuple[float, float, int]
+_ACCELERATION, _RATE = (10.0, 9.0, 3), (6.0, 8.0, 8)
 _HERTZ: Final = 0.5 * 2.0 ** (np.arange(21) / 2)
 # Extrapolation goes no further, though slow filters of the IMU ask for up to 65 ms: its noise grows with it.
 _FURTHEST_S: Final = 0.002
@@ -79,13 +80,16 @@ def align(
         for share in (_HERTZ / rate_hz).tolist()
     ]
     ahead = math.ceil(max(at_s, 0.0) * rate_hz)
-    count = ahead + (FIR_TAPS // 2 + 2 if fir else max(3, round(_HISTORY_S * rate_hz)))
-    ages, given = np.arange(count) / rate_hz, np.array(gains)
+    counts = [ahead + (FIR_TAPS // 2 + 2 if fir else max(3, round(each * rate_hz))) for each in _HISTORY_S]
+    given, count = np.array(gains), counts[1]
     (value, _), turned = (
-        _weights(motion, noise, ages, lag, given)
-        for motion, noise, lag in zip((_ACCELERATION, _RATE), imu_noise({}), lags_s, strict=True)
+        _weights(motion, noise, np.arange(length) / rate_hz, lag, given)
+        for motion, noise, lag, length in zip(
+            (_ACCELERATION, _RATE), imu_noise({}), lags_s, counts, strict=True
+        )
     )
-    taps = np.array([np.eye(count)[0] if known_s is None else value, *turned])[:, ::-1]
+    value = np.ones(1) if known_s is None else value
+    taps = np.array([np.pad(value, (0, count - len(value))), *turned])[:, ::-1]
     gap_s = max(_FIR_GAP_S if fir else _GAP_S, _GAP_PERIODS / rate_hz) if is_known else _UNKNOWN_GAP_S
     lead = 1 + math.floor(max(at_s, 0.0) * rate_hz) + 2 * fir
     lead = min(lead + max(1, math.ceil(_LINE_S * rate_hz)), count)
@@ -98,11 +102,13 @@ def gyroscope_later_s(settings: Mapping[str, SettingValue]) -> float:
     return (gyroscope.delay_s or 0.0) - (accelerometer.delay_s or 0.0)
 
 
-def _weights(motion: tuple[float, float], noise: float, ages: Array, lag_s: float, gains: Array) -> Array:
+def _weights(
+    motion: tuple[float, float, int], noise: float, ages: Array, lag_s: float, gains: Array
+) -> Array:
     """(2, n): of samples of these `ages`, to value and slope `lag_s` before now behind filters of `gains`."""
-    (rms, from_hz), pace = motion, 2.0 * math.pi * _HERTZ
+    (rms, from_hz, steepness), pace = motion, 2.0 * math.pi * _HERTZ
     band = 0.5 * math.log(2.0) * _HERTZ / from_hz
-    expected = rms**2 * band / (1.0 + (_HERTZ / from_hz) ** 2) ** 3
+    expected = rms**2 * band / (1.0 + (_HERTZ / from_hz) ** 2) ** steepness
     alike = (expected @ np.cos(np.outer(pace, ages)))[np.abs(np.subtract.outer(*[np.arange(len(ages))] * 2))]
     line, late = np.stack([np.ones(len(ages)), ages]), np.outer(pace, ages - lag_s)
     normal = np.block([[alike + noise**2 * np.eye(len(ages)), line.T], [line, np.zeros((2, 2))]])

@@ -19,6 +19,7 @@ from bota_ft_compensation.quantities import (
     Accelerometer,
     CompensationError,
     Payload,
+    Six,
     Wrench,
     length,
     wrench_text,
@@ -56,6 +57,7 @@ class TareBasis(NamedTuple):
     # During the tare, in the sensor's frame, m/s². None: unknown. Zero: of no tare, it holds for any.
     specific_force: Vector3 | None = ZERO
     accelerometer: Accelerometer | None = None  # as it was corrected, where that is by the sensor's own
+    noise: Six = (0.0,) * 6  # meanwhile, as `Accuracy.noise`
 
     def for_payload(self, payload: Payload) -> tuple[Wrench, TareBasis]:
         """By how much the bias is another for this payload; nothing if the specific force is unknown."""

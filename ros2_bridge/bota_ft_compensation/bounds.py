@@ -1,103 +1,144 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How wrong the compensated wrench may be: 95 % bounds of what is not contact, N and Nm, in plain floats.
+"""How wrong the compensated wrench may be without contact: 95 % bounds of a sample, N and Nm.
 
-The one place in Python; `Bounds` in compensation.hpp is its twin. The bound of force is for any pose; that of
-torque for one sample, whose motion is known: an unknown inertia matters only while the tool spins. Both are
-to be computed when they are shown, not for every sample.
+In 95 % of samples the error of the force is less than its bound, and likewise that of the torque. A sample's
+variance is the sum of four: the noise of force and torque, as measured or of a healthy sensor, with the
+filters in force; the IMU's, times mass, lever and tensor; what is not known of tool and IMU, in this pose and
+motion; and what alignment leaves of quick motion. The one place in Python; `Bounds` in compensation.hpp is
+its twin. Plain floats, or arrays of samples.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from bota_ethercat.sensor.response import healthy_noise
+from bota_ethercat.sensor.response import healthy_noise, noise_ratios
+from bota_ethercat.settings import SettingValue
 from bota_ft_compensation.alignment import Alignment
 from bota_ft_compensation.bias import TareBasis
 from bota_ft_compensation.quantities import (
     NORMAL_95,
     STILL,
+    UNKNOWN_ACCURACY,
+    UPRIGHT,
+    ZERO,
     Accelerometer,
+    Accuracy,
     Payload,
+    Six,
     Turning,
-    length,
     likely_inertia,
 )
 
-# From half of an interval of one axis to the radius that holds as often for three (chi, 3 degrees), ...
-_ABOUT_THREE_AXES: Final = 2.80 / NORMAL_95
-# ... and for three times the distance between the directions of gravity in two poses, which are any.
-_BETWEEN_POSES: Final = 4.39 / NORMAL_95
-IMU_BELOW: Final = 0.026  # m: how far the IMU is behind the wrench origin
-_SHORTEST_SINC: Final = 51  # where the length is not known
+# Chi squared that 95 % keep to, by the sum of the variances: of the three axes of force, which are alike, and
+# of torque, of which about two are.
+_OF_FORCE, _OF_TORQUE = 7.815 / 3.0, 2.8
 _TYPED: Final = 0.1  # of its largest element: half of the interval of a tensor that is given without one
+# Of an IMU that is not identified: how far from its place, m, and how wrong its angular acceleration is; of
+# any, what alignment leaves of that.
+_OFF_PLACE, _SPIN, _ALIGNED = 1.3e-3, 0.0075, 0.006
+_REFERENCE_SINC: Final = 51
+_NO_TARE: Final = TareBasis()
 
 
-def force_bound_95(payload: Payload, accelerometer: Accelerometer, taken: TareBasis | None = None) -> float:
-    """N: in 95 % of cases what is not known of the accelerometer shows as less force, in any pose.
+def at_reference(noise: Iterable[float], settings: Mapping[str, SettingValue]) -> Six:
+    """Deviations of samples with these settings, as `Accuracy.noise` has them."""
+    a, b, c, d, e, f = (each / ratio for each, ratio in zip(noise, noise_ratios(settings), strict=True))
+    return a, b, c, d, e, f
 
-    A bias `taken` by a tare that went by this accelerometer has the part of its offset in it, and what its
-    scale and crossed axes did in that pose.
+
+class Bounds:
+    """Of samples with one tool, bias and filters. Variances are sums of three axes, N² and Nm².
+
+    Attributes:
+        noise: deviations of force and torque, N and Nm, of the sensor alone.
+        imu: variances by the IMU's noise.
+        unknown: variances of what is not known of tool and IMU, in any pose.
+        by_felt: likewise for each (m/s²)² along each axis, of the specific force less that of the tare.
+        by_spin: likewise for each (rad/s²)² about each axis.
     """
-    cross = accelerometer.cross_axis_interval
-    largest = STANDARD_GRAVITY * max(*accelerometer.scale_interval, *cross)
-    if taken is not None and taken.accelerometer == accelerometer:
-        return payload.mass * _BETWEEN_POSES * largest
-    per_axis = zip(
-        accelerometer.offset_interval, accelerometer.scale_interval, cross[::2], cross[1::2], strict=True
-    )
-    halves = [math.hypot(offset, STANDARD_GRAVITY * max(parts)) for offset, *parts in per_axis]
-    return payload.mass * _ABOUT_THREE_AXES * max(halves)
 
+    def __init__(
+        self, payload: Payload, accelerometer: Accelerometer | None, alignment: Alignment, lever: Vector3,
+        taken: TareBasis | None = None, accuracy: Accuracy = UNKNOWN_ACCURACY,
+    ) -> None:  # fmt: skip
+        """`accelerometer`: None where gravity is not from it; `lever`: from the IMU to the center of gravity,
+        m; `taken`: what the bias was taken with.
+        """
+        taken, by_imu = taken or _NO_TARE, float(accelerometer is not None)
+        mass, center, tensor, center_halves, _ = payload
+        known = taken.noise, accuracy.noise, healthy_noise(_REFERENCE_SINC), noise_ratios(alignment.settings)
+        self.noise = [(a or b or healthy) * ratio for a, b, healthy, ratio in zip(*known, strict=True)]
+        # What an angular acceleration about each axis makes of force and torque, squared.
+        arm = mass * sum(c * d for c, d in zip(center, lever, strict=True))
+        forces = [mass * mass * (_squared(lever) - d * d) for d in lever]
+        torques = [
+            sum(
+                (arm * (i == j) - mass * d * center[i] + element) ** 2
+                for j, (d, element) in enumerate(zip(lever, row, strict=True))
+            )
+            for i, row in enumerate(_matrix(tensor))
+        ]
+        at_arm, (felt, spin) = 2.0 / 3.0 * _squared(center), (each * each for each in alignment.noise())
+        felt = 3.0 * mass * mass * felt
+        self.imu = by_imu * (felt + sum(forces) * spin), by_imu * (at_arm * felt + sum(torques) * spin)
+        self._fixed = self.imu[0] + _squared(self.noise[:3]), self.imu[1] + _squared(self.noise[3:])
+        is_tared = taken.specific_force != ZERO
+        self._from = taken.specific_force if is_tared else ZERO
+        is_same = is_tared and taken.accelerometer == accelerometer
+        wrong = _ALIGNED**2
+        if any(accuracy.left):
+            force, torque = ([3.0 * each * each for each in part] for part in _halved(accuracy.left))
+            self.unknown = (0.0, 0.0) if is_same else (force[0], torque[0])
+            self.by_felt = [force[1] * is_same] * 3, [torque[1] * is_same] * 3
+            self.by_spin = [force[2]] * 3, [torque[2]] * 3
+        else:
+            weight, wrong = (mass / NORMAL_95) ** 2, wrong + _SPIN**2
+            *offsets, x, y, z, xy, xz, yx, yz, zx, zy = (
+                weight * half * half for half in _read_halves(accelerometer)
+            )
+            offset = 0.0 if is_same else sum(offsets)
+            felts = [x + yx + zx, y + xy + zy, z + xz + yz]
+            centers = [weight * half * half for half in center_halves]
+            self.unknown = offset, at_arm * offset
+            self.by_felt = felts, [sum(centers) - c + at_arm * f for c, f in zip(centers, felts, strict=True)]
+            off = 2.0 * by_imu * (mass * _OFF_PLACE) ** 2
+            halves = _matrix([(each / NORMAL_95) ** 2 for each in inertia_halves(payload)])
+            self.by_spin = [off] * 3, [sum(row) + at_arm * off for row in halves]
+        for row, whole in zip(self.by_spin, (forces, torques), strict=True):
+            row[:] = (a + by_imu * wrong * b for a, b in zip(row, whole, strict=True))
 
-def torque_bound_95(
-    payload: Payload,
-    accelerometer: Accelerometer,
-    taken: TareBasis | None = None,
-    felt: Vector3 = (0.0, 0.0, STANDARD_GRAVITY),
-    turning: Turning = STILL,
-    noise: float = 0.0,
-) -> float:
-    """Nm, about the wrench origin: in 95 % of samples without contact less torque is left, in this motion.
+    def at(self, felt: Any = UPRIGHT, turning: Turning = STILL) -> tuple[Any, Any]:
+        """N and Nm, of a sample that felt this specific force at the center of gravity, m/s², and turned so.
 
-    The root of the squares of four: the unknown inertia in this motion (`turning`, rad/s and rad/s²); the
-    center of gravity's interval under the specific force `felt` there, m/s²; `force_bound_95` at its arm; and
-    `noise`, Nm, of the sensor (`torque_noise_95`). `taken` as there. Components may be arrays of samples.
-    """
-    halves, (rate, spin) = inertia_halves(payload), turning
-    sideways = sum(part * part for part in rate) ** 0.5 * _spread(halves, rate) ** 0.5
-    off_center = off_center_95(payload, taken)
-    at_arm = force_bound_95(payload, accelerometer, taken) * length(payload.center)
-    squares = _spread(halves, spin) + 0.25 * sideways**2 + off_center**2 * sum(part * part for part in felt)
-    bound: float = (squares + at_arm**2 + noise**2) ** 0.5
-    return bound
+        Components may be arrays of samples.
+        """
+        (x, y, z), ((wx, wy, wz), (ax, ay, az)) = felt, turning
+        if self._from is None:  # unknown: on average
+            x = y = z = STANDARD_GRAVITY * math.sqrt(2.0 / 3.0)
+        else:
+            fx, fy, fz = self._from
+            x, y, z = x - fx, y - fy, z - fz
+        x, y, z, wx, wy, wz = x * x, y * y, z * z, wx * wx, wy * wy, wz * wz
+        quarter = 0.25 * (wx + wy + wz)  # what centripetal acceleration makes of the square
+        ax, ay, az = ax * ax + quarter * wx, ay * ay + quarter * wy, az * az + quarter * wz
+        (fx, fy, fz), (tx, ty, tz) = self.by_felt
+        (px, py, pz), (qx, qy, qz) = self.by_spin
+        force = self._fixed[0] + self.unknown[0] + fx * x + fy * y + fz * z + px * ax + py * ay + pz * az
+        torque = self._fixed[1] + self.unknown[1] + tx * x + ty * y + tz * z + qx * ax + qy * ay + qz * az
+        return (_OF_FORCE * force) ** 0.5, (_OF_TORQUE * torque) ** 0.5
 
-
-def off_center_95(payload: Payload, taken: TareBasis | None = None) -> float:
-    """kg m: what the center of gravity's interval makes of torque, for each m/s² of specific force."""
-    is_tared = taken is not None and taken.specific_force != (0.0, 0.0, 0.0)
-    factor = _BETWEEN_POSES if is_tared else _ABOUT_THREE_AXES
-    return factor * payload.mass * max(payload.center_interval)
-
-
-def torque_noise_95(payload: Payload, alignment: Alignment) -> float:
-    """Nm: what the noise of a healthy sensor and its IMU keeps to in 95 % of samples."""
-    reach, known = length(payload.center), alignment.settings
-    felt, _ = alignment.noise(reach + IMU_BELOW)
-    healthy = healthy_noise(int(known.get("sinc_length") or _SHORTEST_SINC), fir=bool(known.get("fir")))
-    parts = max(healthy[3:]), payload.mass * reach * felt, inertia_noise(payload, alignment)
-    return _ABOUT_THREE_AXES * NORMAL_95 * math.hypot(*parts)
-
-
-def inertia_noise(payload: Payload, alignment: Alignment) -> float:
-    """Nm: deviation on an axis that the tensor adds to what the noise of the specific force makes of torque.
-
-    Both are of one gyroscope: the tensor's part adds to that of the lever, not to its square.
-    """
-    reach = length(payload.center)
-    lever, spin = payload.mass * reach * (reach + IMU_BELOW), alignment.noise()[1]
-    return spin * math.sqrt((lever + max(payload.inertia[:3])) ** 2 - lever**2)
+    def of_tool(self) -> tuple[float, float, float]:
+        """Deviations on each axis of what is not known: N, Nm, in any pose, and Nm for each rad/s²."""
+        square = STANDARD_GRAVITY**2 * (1.0 if self._from == ZERO else 2.0) / 3.0
+        force, torque = (
+            math.sqrt((each + square * sum(row)) / 3.0)
+            for each, row in zip(self.unknown, self.by_felt, strict=True)
+        )
+        return force, torque, math.sqrt(max(self.by_spin[1]) / 3.0)
 
 
 def inertia_halves(payload: Payload) -> tuple[float, ...]:
@@ -107,10 +148,25 @@ def inertia_halves(payload: Payload) -> tuple[float, ...]:
     if any(payload.inertia):
         return (_TYPED * max(payload.inertia),) * 6
     likely, half = likely_inertia(payload)
-    return tuple(a + b for a, b in zip(likely, half, strict=True))
+    return tuple(math.hypot(NORMAL_95 * a, b) for a, b in zip(likely, half, strict=True))
 
 
-def _spread(halves: tuple[float, ...], turned: Vector3) -> float:
-    """The square of what errors of the tensor's elements make of a vector, each as large as its half."""
-    (xx, yy, zz, xy, xz, yz), (x, y, z) = (tuple(half * half for half in halves)), turned
-    return (xx + xy + xz) * x * x + (xy + yy + yz) * y * y + (xz + yz + zz) * z * z
+def _read_halves(accelerometer: Accelerometer | None) -> Sequence[float]:
+    """Half of the intervals of offset, scale and crossed axes."""
+    if accelerometer is None:
+        return (0.0,) * 12
+    _, _, offset, scale, _, crossed = accelerometer
+    return *offset, *scale, *crossed
+
+
+def _halved(six: Sequence[float]) -> tuple[Sequence[float], Sequence[float]]:
+    return six[:3], six[3:]
+
+
+def _matrix(elements: Sequence[float]) -> tuple[Sequence[float], ...]:
+    xx, yy, zz, xy, xz, yz = elements
+    return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+
+
+def _squared(vector: Iterable[float]) -> float:
+    return sum(part * part for part in vector)

@@ -14,23 +14,13 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Final, NamedTuple
 
-from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from bota_ethercat.sensor.response import fir_taps, healthy_noise, imu_noise
-from bota_ethercat.settings import BASE_SAMPLING_RATE_HZ, SettingValue
-from bota_ft_compensation.alignment import align
-from bota_ft_compensation.bias import TareBasis
-from bota_ft_compensation.bounds import (
-    IMU_BELOW,
-    force_bound_95,
-    inertia_halves,
-    inertia_noise,
-    off_center_95,
-)
+from bota_ethercat.pdo import Vector3
+from bota_ethercat.sensor.response import fir_taps, imu_noise
+from bota_ethercat.settings import SettingValue
+from bota_ft_compensation.bounds import Bounds
 from bota_ft_compensation.quantities import (
-    EXACT,
     STILL,
     ZERO,
-    Accelerometer,
     CompensationError,
     Payload,
     Turning,
@@ -126,25 +116,15 @@ def surface_of(text: str) -> Surface | None:
 
 
 def detector_of(
-    surface: Surface, tool: Payload, settings: Mapping[str, SettingValue], rate_hz: float, *,
-    noise: Sequence[float] = (), accelerometer: Accelerometer | None = EXACT, taken: TareBasis | None = None,
+    surface: Surface, tool: Payload, bounds: Bounds, settings: Mapping[str, SettingValue], rate_hz: float,
     alarms_per_hour: float = 1.0,
 ) -> ContactDetector:  # fmt: skip
-    """For a sensor with these settings; CompensationError.
-
-    `noise` (6), N and Nm, is what it is where that is not measured. `accelerometer`: None where gravity is
-    not from the IMU; `taken`: the pose that the bias is from.
-    """
-    healthy = healthy_noise(round(BASE_SAMPLING_RATE_HZ / rate_hz), fir=bool(settings.get("fir")))
-    noise = [a or b for a, b in zip(noise or healthy, healthy, strict=True)]
-    weight = imu = spun = 0.0
-    if accelerometer is not None:
-        alignment = align(settings, rate_hz)
-        imu, _ = alignment.noise(length(tool.center) + IMU_BELOW)
-        weight, spun = force_bound_95(tool, accelerometer, taken), inertia_noise(tool, alignment)
-    noise = [*noise[:3], *(math.hypot(each, spun) for each in noise[3:])]
-    torque = STANDARD_GRAVITY * off_center_95(tool, taken)
-    known = Uncertainty.of(noise, weight, torque, tool, max(inertia_halves(tool)), imu)
+    """By the bounds of a sensor with these settings; CompensationError."""
+    force, torque = (math.sqrt(each / 3.0) for each in bounds.imu)
+    weight, at_center, spin = bounds.of_tool()
+    noise = [*bounds.noise[:3], *(math.hypot(each, torque) for each in bounds.noise[3:])]
+    imu = force / tool.mass if tool.mass else 0.0
+    known = Uncertainty.of(noise, _CHI_3 * weight, _CHI_3 * at_center, tool, _CHI_3 * spin, imu)
     return ContactDetector(surface, known, rate_hz, correlation(settings), alarms_per_hour)
 
 

@@ -12,7 +12,16 @@ from bota_ethercat.replies import SensorInfo
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.stream.timeline import InForce
 from bota_ft_compensation.alignment import Alignment, align
-from bota_ft_compensation.quantities import EXACT, STILL, ZERO, Accelerometer, Turning
+from bota_ft_compensation.quantities import (
+    EXACT,
+    IDENTITY,
+    STILL,
+    UPRIGHT,
+    ZERO,
+    Accelerometer,
+    Matrix,
+    Turning,
+)
 from bota_ft_compensation.specific_force import ImuSpecificForce
 
 IMU_IS_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
@@ -32,6 +41,7 @@ class Source:
     name = "none"  # for people
     is_imu = False  # whether it is the sensor's own, with the tool's acceleration; else it is minus gravity
     turning: Turning = STILL  # of the latest sample, if `is_imu`
+    felt: Vector3 = UPRIGHT  # likewise
     in_force = InForce(SensorInfo())  # of the latest `configure`
 
     def __init__(self, why: str = "gravity_source is none") -> None:
@@ -65,19 +75,24 @@ class ImuSource(Source):
     is_imu = True
 
     def __init__(
-        self, center: Vector3 = ZERO, position: Vector3 = ZERO, accelerometer: Accelerometer = EXACT
-    ) -> None:
+        self, center: Vector3 = ZERO, position: Vector3 = ZERO, accelerometer: Accelerometer = EXACT,
+        gyroscope: Matrix = IDENTITY,
+    ) -> None:  # fmt: skip
         """`center` of gravity and the IMU's `position` from the wrench origin, m; zeros: as it was made."""
         super().__init__()
         self._center, self._position = center, position
-        self._imu = ImuSpecificForce(accelerometer=accelerometer)
+        self._imu = ImuSpecificForce(accelerometer=accelerometer, gyroscope=gyroscope)
 
     def configure(self, in_force: InForce) -> None:
         before, now, self.in_force = self.in_force.info, in_force.info, in_force
-        (x, y, z), (cx, cy, cz) = imu_position(now.name, self._position), self._center
-        self._imu.lever = cx - x, cy - y, cz - z
+        self._imu.lever = self.lever_of(now.name)
         if (before.settings, before.rate_hz) != (now.settings, now.rate_hz):
             self._imu.align(align(now.settings, now.rate_hz))
+
+    def lever_of(self, name: str) -> Vector3:
+        """From the IMU of the model `name` to the center of gravity, m."""
+        (x, y, z), (cx, cy, cz) = imu_position(name, self._position), self._center
+        return cx - x, cy - y, cz - z
 
     @property
     def alignment(self) -> Alignment:
@@ -85,16 +100,16 @@ class ImuSource(Source):
         return self._imu.alignment
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
-        acceleration = sample.acceleration
-        found = self._imu.follow(acceleration, sample.angular_rate, time_s)
-        self.turning = self._imu.turning
-        return found if any(acceleration) else None
+        return self.follow(sample.acceleration, sample.angular_rate, time_s)
 
     def follow(self, acceleration: Vector3, angular_rate: Vector3, time_s: float) -> Vector3 | None:
         """As `specific_force`, of a sample's m/s² and rad/s."""
         found = self._imu.follow(acceleration, angular_rate, time_s)
         self.turning = self._imu.turning
-        return found if any(acceleration) else None
+        if found is None or not any(acceleration):
+            return None
+        self.felt = found
+        return found
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         if not any(sample.acceleration):

@@ -24,6 +24,7 @@ class CompensationError(Exception):
 
 Turning = tuple[Vector3, Vector3]  # angular rate, rad/s, and angular acceleration, rad/s²
 STILL: Final[Turning] = (ZERO, ZERO)
+UPRIGHT: Final[Vector3] = (0.0, 0.0, STANDARD_GRAVITY)  # specific force at rest
 
 
 class Wrench(NamedTuple):
@@ -73,7 +74,7 @@ def wrench_text(wrench: Wrench) -> str:
 
 NO_PAYLOAD: Final = Payload()
 _REACH: Final = 0.1  # m: how far the mass of a tool is likely to be from a center of gravity at the origin
-_LIKELY: Final = 0.2
+_LIKELY, _ABOUT = 0.2, 0.6
 # m/s²: standard deviation of the offset of an axis of a MEMS accelerometer, once soldered.
 OFFSET_PRIOR: Final = 0.4
 # Likewise of an axis' sensitivity, relative (local gravity is within it), and of what it has of another axis.
@@ -109,6 +110,23 @@ class Accelerometer(NamedTuple):
 
 
 EXACT: Final = Accelerometer()
+Matrix = tuple[float, ...]  # nine numbers, row by row
+IDENTITY: Final[Matrix] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+class Accuracy(NamedTuple):
+    """What an identification knows of the errors of compensation: standard deviations on each axis.
+
+    Zeros: not known. `left` is what a tool and an IMU that motion identified together leave, where their
+    intervals, one by one, would say too much: N in any pose, N for each m/s² by which the specific force is
+    another than in a tare, N for each rad/s²; and Nm likewise.
+    """
+
+    noise: Six = (0.0,) * 6  # of a sample's force, N, and torque, Nm, as it would be at SINC 51 with FIR off
+    left: Six = (0.0,) * 6
+
+
+UNKNOWN_ACCURACY: Final = Accuracy()
 
 
 def likely_inertia(payload: Payload) -> tuple[Six, Six]:
@@ -117,7 +135,7 @@ def likely_inertia(payload: Payload) -> tuple[Six, Six]:
     Of tools that begin at the sensor: they reach about as far beyond their center of gravity as it is away.
     """
     largest = payload.mass * (_REACH**2 + length(payload.center) ** 2)
-    moment, half = _LIKELY * largest, largest
+    moment, half = _LIKELY * largest, _ABOUT * largest
     return (moment, moment, moment, 0.0, 0.0, 0.0), (half, half, half, *(_LIKELY * largest,) * 3)
 
 

@@ -25,9 +25,11 @@ from bota_ft_compensation.outputs import WrenchTransform
 from bota_ft_compensation.quantities import (
     DEFAULT_GRAVITY,
     EXACT,
+    IDENTITY,
     STILL,
     ZERO,
     Accelerometer,
+    Matrix,
     Quaternion,
 )
 
@@ -45,13 +47,17 @@ class ImuSpecificForce:
     """
 
     def __init__(
-        self, lever: Vector3 = ZERO, accelerometer: Accelerometer = EXACT, alignment: Alignment | None = None
-    ) -> None:
-        """`lever` is d, m; `accelerometer` corrects what it reads."""
+        self, lever: Vector3 = ZERO, accelerometer: Accelerometer = EXACT, alignment: Alignment | None = None,
+        gyroscope: Matrix = IDENTITY,
+    ) -> None:  # fmt: skip
+        """`lever` is d, m; `accelerometer` corrects what it reads; angular rates are `gyroscope` times those
+        that are read.
+        """
         self.lever = lever
         # Angular rate (rad/s) and acceleration (rad/s²) of the latest sample, at force and torque's instant.
         self.turning = STILL
         self._correct = accelerometer.correct
+        self._gyroscope = None if gyroscope == IDENTITY else gyroscope
         self.align(alignment or align({}))
 
     def align(self, alignment: Alignment) -> None:
@@ -69,6 +75,11 @@ class ImuSpecificForce:
         None if it is not finite, or if the sensor moves, or did before a gap, and what was just before the
         sample, and so how fast it spins up, is not known.
         """
+        if self._gyroscope:
+            (wx, wy, wz), (xx, xy, xz, yx, yy, yz, zx, zy, zz) = angular_rate, self._gyroscope
+            angular_rate = (
+                xx * wx + xy * wy + xz * wz, yx * wx + yy * wy + yz * wz, zx * wx + zy * wy + zz * wz,
+            )  # fmt: skip
         row = (*self._correct(acceleration), *angular_rate)
         total = sum(row)
         if total - total != 0.0:  # NaN or infinity
@@ -122,7 +133,8 @@ class ImuSpecificForce:
     def _append(self, row: Row | Array) -> None:
         self._filled += 1
         self._at = at = (self._at + 1) % self._size
-        self._ring[at] = self._ring[at + self._size] = row
+        self._ring[at] = row
+        self._ring[at + self._size] = self._ring[at]  # faster than from numbers again
 
 
 def _turns(rate: Sequence[float]) -> bool:

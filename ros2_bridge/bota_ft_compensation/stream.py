@@ -31,7 +31,7 @@ from bota_ethercat.stream.usable import (
 )
 from bota_ft_compensation.alignment import Array, align
 from bota_ft_compensation.bias import BiasRamp
-from bota_ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
+from bota_ft_compensation.bounds import Bounds, at_reference
 from bota_ft_compensation.compensator import Compensator, Stages
 from bota_ft_compensation.contact import ContactDetector, Surface, detector_of
 from bota_ft_compensation.imu import IMU_IS_OFF, ImuSource, Source
@@ -40,8 +40,10 @@ from bota_ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
     STILL,
+    UNKNOWN_ACCURACY,
     ZERO,
     Accelerometer,
+    Accuracy,
     Payload,
     Turning,
     Wrench,
@@ -122,6 +124,7 @@ class Plan(NamedTuple):
     payload: Payload = NO_PAYLOAD
     ramp: BiasRamp = BiasRamp()
     accelerometer: Accelerometer = EXACT
+    accuracy: Accuracy = UNKNOWN_ACCURACY
 
     @property
     def has_tool(self) -> bool:
@@ -146,6 +149,7 @@ class CompensatedStream:
         self.forbidden = self.hold = ""
         self.in_force, self.own_offset = InForce(SensorInfo()), OwnOffset()
         self._compensator = Compensator()
+        self._made: tuple[object, Bounds | None] = (None, None)  # what the bounds are made of, and they
         self._newest_s = self._doubted_until_s = -math.inf
 
     def configure(self, in_force: InForce) -> None:
@@ -181,7 +185,7 @@ class CompensatedStream:
         Zero without a tool, unless `always`. Every new sample is to come here, in order; `time_s` is by the
         server's monotonic clock, `stamp_s` since 1970.
         """
-        source, payload, _, _ = self.plan
+        source, payload, *_ = self.plan
         in_force, self._newest_s = self.in_force, time_s
         if payload.mass <= 0.0 and not always:
             return ZERO
@@ -214,7 +218,7 @@ class CompensatedStream:
 
     def stages(self, sample: Any, time_s: float, felt: Vector3, turning: Turning | None = None) -> Stages:
         """Every stage of a sample in which `felt` was felt. Components may be arrays of samples."""
-        (source, payload, ramp, _), compensator = self.plan, self._compensator
+        (source, payload, ramp, *_), compensator = self.plan, self._compensator
         compensator.payload, compensator.bias = payload, ramp.at(time_s)
         if turning is None:
             turning = source.turning
@@ -223,7 +227,7 @@ class CompensatedStream:
     def compensate(self, samples: Any) -> tuple[Array, Array]:
         """n samples as arrays, attributes as of a `Sample`, and `monotonic_ns`, by the IMU.
 
-        (n, 6) N, Nm, NaN where it is not known or may not be used; (n, 2) `bounds`.
+        (n, 6) N, Nm, NaN where it is not known or may not be used; (n, 2) `bounds`, N and Nm.
         """
         source, times = self.plan.source, samples.monotonic_ns * 1e-9
         assert isinstance(source, ImuSource)
@@ -246,25 +250,36 @@ class CompensatedStream:
         self._newest_s = times[-1] if len(times) else self._newest_s
         return found, np.column_stack(np.broadcast_arrays(*self.bounds(felt.T, turning), times)[:2])
 
-    def bounds(self, felt: Any = None, turning: Any = None) -> tuple[float, float]:
-        """95 % bounds of what is wrong with force (N, in any pose) and torque (Nm, in this motion)."""
-        (source, payload, ramp, known), info, noise = self.plan, self.in_force.info, 0.0
-        if isinstance(source, ImuSource):
-            is_current = source.in_force is self.in_force  # not without samples
-            alignment = source.alignment if is_current else align(info.settings, info.rate_hz)
-            noise = torque_noise_95(payload, alignment)
-        taken = ramp.taken
-        motion = {} if felt is None else {"felt": felt}
-        turning = source.turning if turning is None else turning
-        torque = torque_bound_95(payload, known, taken, turning=turning, noise=noise, **motion)
-        return force_bound_95(payload, known, taken), torque
+    def bounds(self, felt: Any = None, turning: Any = None) -> tuple[Any, Any]:
+        """95 % bounds of the error of a sample's force, N, and torque, Nm; without contact.
+
+        Of one that felt `felt`, m/s², and turned so; None: as the latest.
+        """
+        source = self.plan.source
+        felt, turning = source.felt if felt is None else felt, source.turning if turning is None else turning
+        return self._bounds().at(felt, turning)
+
+    def _bounds(self, noise: Sequence[float] = ()) -> Bounds:
+        """By what is in force; `noise` of the sensor, 6, N and Nm, if it is known otherwise."""
+        plan, info = self.plan, self.in_force.info
+        source, by_imu = plan.source, isinstance(plan.source, ImuSource)
+        made_of = plan.payload, plan.accelerometer, plan.ramp.taken, plan.accuracy, source, info, noise
+        made, found = self._made
+        if found is None or made_of != made:
+            aligned, taken = align(info.settings, info.rate_hz), plan.ramp.taken
+            if any(noise):
+                taken = taken._replace(noise=at_reference(noise, info.settings))
+            lever = source.lever_of(info.name) if isinstance(source, ImuSource) else ZERO
+            read = plan.accelerometer if by_imu else None
+            found = Bounds(plan.payload, read, aligned, lever, taken, plan.accuracy)
+            self._made = made_of, found
+        return found
 
     def contact_detector(
         self, surface: Surface, noise: Sequence[float] = (), alarms_per_hour: float = 1.0
     ) -> ContactDetector:
         """Of contact with the tool, by what is in force; `noise` as there. CompensationError."""
-        plan, info = self.plan, self.in_force.info
+        info = self.in_force.info
         return detector_of(
-            surface, plan.payload, info.settings, info.rate_hz, noise=noise, taken=plan.ramp.taken,
-            accelerometer=plan.accelerometer if plan.source.is_imu else None, alarms_per_hour=alarms_per_hour,
-        )  # fmt: skip
+            surface, self.plan.payload, self._bounds(noise), info.settings, info.rate_hz, alarms_per_hour
+        )

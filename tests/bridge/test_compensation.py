@@ -16,10 +16,10 @@ from rclpy.parameter import Parameter
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import encode, layout_for
 from bota_ft_compensation.alignment import align
-from bota_ft_compensation.bias import TareBasis
-from bota_ft_compensation.bounds import force_bound_95, torque_bound_95, torque_noise_95
+from bota_ft_compensation.bounds import Bounds
 from bota_ft_compensation.identification.weighted import Array
-from bota_ft_compensation.quantities import Accelerometer, Payload
+from bota_ft_compensation.imu import ImuSource
+from bota_ft_compensation.quantities import UNKNOWN_ACCURACY, Accelerometer, Accuracy, Payload
 from tests.bridge.simulated_node import (
     OVER,
     QUICK,
@@ -468,26 +468,32 @@ def test_setting_the_wall_clock_changes_nothing(arm: Arm, moved: Node, set_by_s:
     assert forces(stages).max() < 0.35
 
 
-def test_what_the_accelerometers_own_errors_may_make_is_told_in_newtons(arm: Arm, moved: Node) -> None:
-    """As it is expected of any, and as identification has found it."""
+def test_how_wrong_the_force_may_be_is_told(arm: Arm, moved: Node) -> None:
+    """As it is expected of any IMU and sensor, after a tare, and as identification has found them."""
     arm.hold(UP)
     Stages(moved)
 
     def told() -> float:
-        return float(values(moved.until(compensation="ok")["compensation"])["accelerometer_force"])
+        return float(values(moved.until(compensation="ok")["compensation"])["force_bound"])
 
-    assert told() == pytest.approx(force_bound_95(HEAVY, Accelerometer()), abs=1e-3)
+    def expected(known: Accelerometer, accuracy: Accuracy = UNKNOWN_ACCURACY) -> float:
+        lever = ImuSource(HEAVY.center).lever_of("BFT-SENS-ECAT-M8")
+        return float(Bounds(HEAVY, known, align(SETTINGS, RATE_HZ), lever, None, accuracy).at()[0])
+
+    assert told() == pytest.approx(expected(Accelerometer()), rel=0.01)
     moved.do("tare")  # by this accelerometer, whose offset is part of the bias from now on
-    taken = TareBasis(HEAVY, None, Accelerometer())
-    assert told() == pytest.approx(force_bound_95(HEAVY, Accelerometer(), taken), abs=1e-3)
-    assert told() < 0.5
+    assert told() < 0.7 * expected(Accelerometer())
     known = Accelerometer(
         offset_interval=(0.02,) * 3, scale_interval=(0.0,) * 3, cross_axis_interval=(0.0,) * 6
     )
     for name in ("offset_interval", "scale_interval", "cross_axis_interval"):
         moved.set(f"accelerometer.{name}", [*getattr(known, name)])
-    assert told() == pytest.approx(force_bound_95(HEAVY, known), abs=1e-3)
-    assert force_bound_95(HEAVY, known) < 0.1 * force_bound_95(HEAVY, Accelerometer())
+    moved.set("bias", [0.01] * 6)  # of no tare
+    assert told() == pytest.approx(expected(known), rel=0.01)
+    quiet = Accuracy(noise=(0.01,) * 3 + (0.001,) * 3)
+    moved.set("accuracy.noise", [*quiet.noise])
+    assert told() == pytest.approx(expected(known, quiet), rel=0.01)
+    assert expected(known, quiet) < 0.9 * expected(known)
 
 
 def test_how_wrong_the_torque_may_be_is_told_in_the_present_motion(arm: Arm, moved: Node) -> None:
@@ -498,8 +504,7 @@ def test_how_wrong_the_torque_may_be_is_told_in_the_present_motion(arm: Arm, mov
         return float(values(moved.until(compensation="ok")["compensation"])["torque_bound"])
 
     arm.hold(UP)
-    still, noise = told(), torque_noise_95(HEAVY, align(SETTINGS, RATE_HZ))
-    assert still == pytest.approx(torque_bound_95(HEAVY, Accelerometer(), noise=noise), abs=2e-3)
+    still = told()
     arm.play(feel(guided(5, radians=1.0), HEAVY, 20.0, 1.0 / STEP_S))
     moved.run(1.0)
     moving = max(told() for _ in range(3))

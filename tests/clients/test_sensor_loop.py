@@ -20,12 +20,12 @@ from bota_clients.identify.cli import main as identify
 from bota_ethercat.control import Event, event
 from bota_ethercat.framing import DataFlag, encode_data
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
-from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ft_compensation.alignment import align
 from bota_ft_compensation.bias import TareBasis
-from bota_ft_compensation.bounds import force_bound_95, torque_bound_95
+from bota_ft_compensation.bounds import Bounds
 from bota_ft_compensation.compensator import Compensator
-from bota_ft_compensation.quantities import ZERO, Accelerometer, Payload
+from bota_ft_compensation.imu import ImuSource
+from bota_ft_compensation.quantities import ZERO, Accelerometer, Accuracy, Payload
 from bota_ft_compensation.specific_force import ImuSpecificForce
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.cpp_programs import (
@@ -223,6 +223,8 @@ TOOL = {
     "accelerometer.offset": "0.3,-0.2,0.1",
     "accelerometer.scale": "1.01,0.99,1.002",
     "accelerometer.cross_axis": "0.001,-0.002,0.003,-0.004,0.005,-0.006",
+    "gyroscope_matrix": "1.01,0.002,-0.003,0.004,0.99,0.005,-0.006,0.007,1.02",
+    "imu_position": "0,0,-0.03",
 }
 
 
@@ -272,7 +274,7 @@ def test_the_load_of_the_tool_is_that_of_python(
     x, y, z = tool.center
     aligned = align({**settings(), "fir": bool(fir)}, rate_hz, lag_ms / 1e3)
     imu = ImuSpecificForce(
-        (x, y, z - IMU_HEIGHTS["SENS"]), Accelerometer(rows[3], rows[4], cross_axis=rows[5]), aligned
+        (x, y, z - rows[7][2]), Accelerometer(rows[3], rows[4], cross_axis=rows[5]), aligned, rows[6]
     )
     for number, (time_s, values) in enumerate(samples):
         ax, ay, az, wx, wy, wz = values
@@ -289,7 +291,7 @@ def test_the_load_of_the_tool_is_that_of_python(
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_bounds_are_those_of_python(running: Loop, seed: int) -> None:
-    """Identified, typed and unknown tensors; after a tare, and without."""
+    """Identified, typed and unknown tensors; after a tare, and without; of tools identified in motion."""
     draw = random.Random(seed)
 
     def some(count: int, largest: float, *, likely: float = 1.0) -> Any:
@@ -300,19 +302,29 @@ def test_the_bounds_are_those_of_python(running: Loop, seed: int) -> None:
     imu = Accelerometer(
         offset_interval=some(3, 0.8), scale_interval=some(3, 0.01), cross_axis_interval=some(6, 0.01)
     )
+    known = Accuracy(some(6, 0.2, likely=float(seed % 2)), some(6, 0.1, likely=float(seed % 4 == 1)))
+    place, (rate_hz, fir, lag_s) = (
+        some(3, 0.05),
+        [(800.0, 0, 1e-3), (100.0, 1, 0.1), (1600.0, 0, 0.0)][seed % 3],
+    )
     rows = {
         "tool_mass": [tool.mass],
         "tool_center_of_gravity": tool.center, "tool_inertia": tool.inertia,
         "tool_center_of_gravity_interval": tool.center_interval,
-        "tool_inertia_interval": tool.inertia_interval,
+        "tool_inertia_interval": tool.inertia_interval, "imu_position": place,
+        "accuracy.noise": known.noise, "accuracy.left": known.left,
     }  # fmt: skip
     rows |= {f"accelerometer.{name}": part for name, part in imu._asdict().items() if "interval" in name}
     assert running.new(**{name: ",".join(map(repr, row)) for name, row in rows.items()}) == ""
-    felt, rate, spin, noise = some(3, 20.0), some(3, 3.0), some(3, 20.0), draw.uniform(0.0, 0.02)
-    for taken in (None, TareBasis(tool, (0.0, 0.0, 9.8), imu)):
-        told = running.do("bounds", int(taken is not None), *map(repr, (*felt, *rate, *spin, noise)))
-        torque = torque_bound_95(tool, imu, taken, felt, (rate, spin), noise)
-        assert told == pytest.approx([force_bound_95(tool, imu, taken), torque])
+    felt, rate, spin, at = some(3, 20.0), some(3, 3.0), some(3, 20.0), some(3, 9.8)
+    aligned = align(settings(round(51200 / rate_hz), bool(fir)), rate_hz, lag_s)
+    lever = ImuSource(tool.center, place).lever_of("")
+    for tared, taken in enumerate((None, TareBasis(tool, None, imu), TareBasis(tool, at, imu))):
+        told = running.do(
+            "bounds", "NONE", lag_s, fir, rate_hz, tared, *map(repr, (*felt, *rate, *spin, *at))
+        )
+        found = Bounds(tool, imu, aligned, lever, taken, known).at(felt, (rate, spin))
+        assert told == pytest.approx(found, rel=1e-6)
 
 
 @pytest.mark.parametrize(("model", "heights"), [*FIGURES.items(), ("NONE", (0.0, 0.0))])

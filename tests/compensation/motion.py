@@ -54,6 +54,9 @@ class Imperfection(NamedTuple):
     acceleration_offset: Vector3 = (0.0, 0.0, 0.0)  # m/s²
     scale: Vector3 = (1.0, 1.0, 1.0)
     cross_axis: tuple[float, ...] = (0.0,) * 6  # what is to be subtracted: xy xz yx yz zx zy
+    gyroscope: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)  # reads so, row by row
+    turned: Vector3 = (0.0, 0.0, 0.0)  # rad: the chip, against the wrench
+    moved: Vector3 = (0.0, 0.0, 0.0)  # m: off its place
 
     @property
     def known(self) -> Accelerometer:
@@ -72,6 +75,18 @@ def imperfect(seed: int) -> Imperfection:
     a, b, c = (1.0 + SCALE_PRIOR * draw.normal(size=3)).tolist()
     crossed = tuple((SCALE_PRIOR * draw.normal(size=6)).tolist())
     return Imperfection(acceleration_offset=(x, y, z), scale=(a, b, c), cross_axis=crossed)
+
+
+def tool_of(seed: int, mass: float = 1.5) -> Payload:
+    """Eight lumps in a box of 8 to 24 cm, somewhere before the sensor."""
+    draw = np.random.default_rng([seed, 3])
+    at, lumps = draw.uniform(0.0, 2.0 * np.pi), draw.dirichlet(np.full(8, 3.0)) * mass
+    places = draw.uniform(-1.0, 1.0, size=(8, 3)) * draw.uniform(0.04, 0.12, size=3)
+    places -= lumps @ places / mass
+    second = (places.T * lumps) @ places
+    j = np.trace(second) * np.eye(3) - second
+    center = 0.06 * math.cos(at), 0.06 * math.sin(at), draw.uniform(0.02, 0.05)
+    return Payload(mass, center, (j[0, 0], j[1, 1], j[2, 2], j[0, 1], j[0, 2], j[1, 2]))
 
 
 class Felt(NamedTuple):
@@ -98,7 +113,7 @@ def feel(
     """The samples of `path` with the wrench's origin on it."""
     finer = _finer(rate_hz)
     samples = len(np.arange(0.0, seconds, 1.0 / rate_hz))
-    truth = _truth(path, tool, 0.0, (samples - 1) * finer + 1, 1.0 / finer / rate_hz)
+    truth = _truth(path, tool, 0.0, (samples - 1) * finer + 1, 1.0 / finer / rate_hz, imu.moved)
     return _read(Felt(*(part[::finer] for part in truth)), imu, seed)
 
 
@@ -121,7 +136,7 @@ def filtered(
     step_s, full = 1.0 / finer / rate_hz, SINC_ORDER + FIR_TAPS  # samples until the filters are full
     early_s = SINC_ORDER / 2 * step_s  # by which averages over steps are early
     begin_s, count = -full / rate_hz - early_s, (full + len(times)) * finer
-    truth = _truth(path, tool, begin_s, count, step_s)
+    truth = _truth(path, tool, begin_s, count, step_s, imu.moved)
     sinc = np.ones(1)
     for _ in range(SINC_ORDER):
         sinc = np.convolve(sinc, np.full(finer, 1 / finer))
@@ -144,8 +159,8 @@ def _finer(rate_hz: float) -> int:
     return max(1, round(_GRID_HZ / rate_hz))
 
 
-def _truth(path: Path, tool: Payload, begin_s: float, count: int, step_s: float) -> Felt:
-    """As a perfect IMU at its place feels it, at instants `step_s` apart."""
+def _truth(path: Path, tool: Payload, begin_s: float, count: int, step_s: float, moved_by: Vector3) -> Felt:
+    """As a perfect IMU so far from its place feels it, at instants `step_s` apart."""
     times = begin_s + step_s * np.arange(-2, count + 2, dtype=np.float64)
     positions, angles = path(times)
     turned = rotations(angles)  # sensor to world
@@ -162,7 +177,8 @@ def _truth(path: Path, tool: Payload, begin_s: float, count: int, step_s: float)
     force = -tool.mass * at(tool.center)
     inertia = tensor(tool.inertia)
     torque = np.cross(tool.center, force) - spin @ inertia - np.cross(rate, rate @ inertia)
-    return Felt(times[2:-2], force, torque, at(IMU), rate)
+    x, y, z = np.add(IMU, moved_by).tolist()
+    return Felt(times[2:-2], force, torque, at((x, y, z)), rate)
 
 
 def _read(felt: Felt, imu: Imperfection, seed: int) -> Felt:
@@ -170,9 +186,11 @@ def _read(felt: Felt, imu: Imperfection, seed: int) -> Felt:
     draw, shape = np.random.default_rng(seed), felt.rate.shape
     crossed = np.eye(3)
     crossed[~np.eye(3, dtype=bool)] = -np.array(imu.cross_axis)
-    acceleration = felt.acceleration @ np.linalg.inv(crossed).T * imu.scale + imu.acceleration_offset
+    chip = rotations(np.array(imu.turned[::-1]))  # z, y, x
+    acceleration = felt.acceleration @ chip @ np.linalg.inv(crossed).T * imu.scale + imu.acceleration_offset
     acceleration += draw.normal(scale=imu.acceleration_noise, size=shape)
-    rate = felt.rate + imu.rate_offset + draw.normal(scale=imu.rate_noise, size=shape)
+    rate = felt.rate @ chip @ np.reshape(imu.gyroscope, (3, 3)).T + imu.rate_offset
+    rate += draw.normal(scale=imu.rate_noise, size=shape)
     return felt._replace(acceleration=acceleration, rate=rate)
 
 

@@ -25,9 +25,9 @@ from bota_ft_compensation.quantities import Accelerometer, Payload, Wrench
 from tests.clients.test_identify import record_felt
 from tests.compensation import motion
 from tests.compensation.making import BIAS, SEED, written_parameters
-from tests.compensation.motion import IMU, Array, Felt, left_over
+from tests.compensation.motion import IMU, Array, Felt, left_over, tool_of
 from tests.compensation.motion import Path as Motion
-from tests.compensation.test_inertia import FORCE_NOISE, TORQUE_NOISE, rms, tool_of
+from tests.compensation.test_inertia import FORCE_NOISE, TORQUE_NOISE, rms
 from tests.ended import run_here
 
 PACKAGES: Final = "bota-payload-utils==1.0.3", "bota-tf-utils==1.0.13", "bota-control==1.0.7", "numpy<3"

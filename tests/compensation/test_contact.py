@@ -14,7 +14,7 @@ from bota_ethercat.sensor.response import fir_taps, healthy_noise, imu_noise
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.world import Felt
 from bota_ft_compensation.alignment import align
-from bota_ft_compensation.bounds import IMU_BELOW
+from bota_ft_compensation.bounds import Bounds
 from bota_ft_compensation.contact import (
     Capsule,
     ContactDetector,
@@ -25,6 +25,7 @@ from bota_ft_compensation.contact import (
     correlation,
     detector_of,
 )
+from bota_ft_compensation.imu import ImuSource
 from bota_ft_compensation.quantities import (
     NO_PAYLOAD,
     ZERO,
@@ -214,7 +215,8 @@ def test_the_noise_of_the_gyroscope_on_an_identified_bar_is_no_contact(minutes: 
         felt = motion.filtered(motion.shaken(1.0, 0.0), bar, 61.0, chosen, seed=1000 * SEED + minute, imu=imu)
         left = motion.left_over(felt, bar, align(chosen, RATE_HZ), settling_s=1.0)
         rows = (np.concatenate([left.force, left.torque], axis=1)[: len(beside)] + beside).tolist()
-        contact, was = detector_of(FACE, bar, chosen, RATE_HZ, accelerometer=known), False
+        bounds = Bounds(bar, known, align(chosen, RATE_HZ), ImuSource(bar.center, motion.IMU).lever_of(""))
+        contact, was = detector_of(FACE, bar, bounds, chosen, RATE_HZ), False
         for row, turning in zip(rows, left.turning, strict=False):
             contact.is_contact = True  # which it then is as long as it is not within what 95 % keep to
             beyond.append(contact.update((*row[:3],), (*row[3:],), turning))
@@ -251,7 +253,7 @@ def alarms_in(name: str, seed: int, seconds: float) -> int:
     felt = motion.filtered(path, tool, seconds, chosen, seed=seed, imu=imu)
     left = motion.left_over(felt, point, align(chosen, RATE_HZ), imu.known, settling_s=1.0)
     spin = mass * 0.06**2
-    noisy, _ = align(chosen, RATE_HZ).noise(length(point.center) + IMU_BELOW)
+    noisy, _ = align(chosen, RATE_HZ).noise(length(point.center) + 0.026)
     known = Uncertainty.of(NOISE, 1e-9, 1e-9, point, spin, noisy)
     contact = ContactDetector(FACE, known, RATE_HZ)
     noise = noise_of(chosen, len(left.times)) * NOISE

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -10,24 +9,20 @@ import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ft_compensation.alignment import align
-from bota_ft_compensation.identification.free_motion import _check_free, identify_in_motion
-from bota_ft_compensation.identification.inertia import Turned, identify_inertia, turn
+from bota_ft_compensation.identification.free_motion import identify_in_motion
+from bota_ft_compensation.identification.inertia import turn
 from bota_ft_compensation.identification.payload import Identified
-from bota_ft_compensation.quantities import EXACT, OFFSET_PRIOR, SCALE_PRIOR, Accelerometer, CompensationError
+from bota_ft_compensation.quantities import EXACT, CompensationError
 from tests.compensation import motion
 from tests.compensation.making import BIAS, SEED, check_coverage
-from tests.compensation.motion import IMU, Felt, imperfect, settings
-from tests.compensation.test_inertia import RATE_HZ, path_of, recorded, tool_of
+from tests.compensation.motion import IMU, Felt, imperfect, settings, tool_of
+from tests.compensation.test_inertia import RATE_HZ, path_of, recorded
 from tests.simulation import more_if_long
 
 
 def identified(felt: Felt) -> Identified:
-    def turned(accelerometer: Accelerometer) -> Turned:
-        return turn(felt.times, np.hstack(felt[1:]), align(settings(), RATE_HZ), accelerometer, IMU)
-
-    found = identify_in_motion(turned(EXACT), IMU)
-    assert found.accelerometer is not None
-    return identify_inertia(turned(found.accelerometer.calibration), found)
+    turned = turn(felt.times, np.hstack(felt[1:]), align(settings(), RATE_HZ), EXACT, IMU)
+    return identify_in_motion(turned, IMU)
 
 
 @pytest.mark.parametrize("count", more_if_long([2], [2, 8]))
@@ -52,7 +47,7 @@ def test_intervals_cover_95_percent_in_every_kind_of_motion(count: int) -> None:
             assert found.mass_interval < 0.012 * tool.mass
             assert max(found.payload.center_interval) < 1e-3
     for what, found_of in shares.items():
-        check_coverage(found_of, 0.1 if what in ("mass", "inertia", "scale") else 0.2)
+        check_coverage(found_of, 0.03 if what in ("mass", "scale") else 0.1)  # of one IMU for each seed
 
 
 def upward(felt: Felt, newtons: float) -> Felt:
@@ -117,7 +112,7 @@ def test_a_touch_is_left_out_and_hardly_any_motion_is_refused() -> None:
     with pytest.raises(CompensationError, match=r"do not suffice.*about each axis|cannot be told from zero"):
         identified(recorded("still", SEED + 6, tool))
     found = identified(recorded("about x", SEED + 6, tool))
-    assert found.payload.mass == pytest.approx(tool.mass, abs=found.mass_interval)
+    assert found.payload.mass == pytest.approx(tool.mass, abs=1.5 * found.mass_interval)
     assert "hardly turned about y and z" in found.notes[0]
 
 
@@ -155,22 +150,3 @@ def test_what_is_made_of_a_sample_does_not_depend_on_where_the_recording_begins(
     assert same.sum() > 100
     assert part.felt[same] == pytest.approx(whole.felt[rows][same], abs=1e-6)
     assert part.spun[same] == pytest.approx(whole.spun[rows][same], abs=1e-6)
-
-
-@pytest.mark.parametrize("arm", [0.01, 0.2])
-@pytest.mark.parametrize("share", [0.99, 1.01])
-def test_how_much_may_be_left_of_free_motion(share: float, arm: float) -> None:
-    """From both sides of each limit: rms force and torque, time left out, what no accelerometer has."""
-    weight, answer = 2.0 * STANDARD_GRAVITY, np.zeros(34)
-    answer[0], answer[1:4] = 2.0, 2.0 * arm * np.array((0.6, 0.0, -0.8))
-    force, torque = 0.1 + 0.01 * weight, 0.1 * 0.05 + 0.01 * weight * max(arm, 0.05)
-    rows, priors = np.zeros((2, 6)), [OFFSET_PRIOR] * 3 + [SCALE_PRIOR] * 9
-    beyond = [answer + (-1) ** n * share * 5.0 * prior * np.eye(34)[22 + n] for n, prior in enumerate(priors)]
-    for each, left, kept in (
-        (answer, rows + share * force * np.array([0.8, 0.0, 0.6, 0.0, 0.0, 0.0]), 1.0),
-        (answer, rows + share * torque * np.array([0.0, 0.0, 0.0, 0.8, 0.6, 0.0]), 1.0),
-        (answer, rows, 0.6 / share),
-        *((each, rows, 1.0) for each in beyond),
-    ):
-        with contextlib.nullcontext() if share < 1 else pytest.raises(CompensationError, match=FREE):
-            _check_free(each, 0.1, left, kept)

@@ -18,7 +18,8 @@ def turning(seconds: float) -> Felt:
     """Rolls round slowly, over and over, while it pitches up and down."""
     speed = math.tau / TURN_LENGTH
     rolled = speed * seconds
-    return carry((0.0, _PITCH * math.sin(rolled), rolled), (0.0, _PITCH * speed * math.cos(rolled), speed))
+    pitch, rate = _PITCH * math.sin(rolled), _PITCH * speed * math.cos(rolled)
+    return carry(((0.0, pitch, rolled), (0.0, rate, speed), (0.0, -speed * speed * pitch, 0.0)))
 
 
 def measured(

@@ -30,17 +30,16 @@ from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.program.new_file import refuse_existing
 from bota_ft_compensation.alignment import align
 from bota_ft_compensation.identification.free_motion import identify_in_motion
-from bota_ft_compensation.identification.inertia import Turned, identify_inertia, turn
+from bota_ft_compensation.identification.inertia import Turned, turn
 from bota_ft_compensation.identification.parameter_file import write_yaml
-from bota_ft_compensation.identification.payload import Fit, Identified, identify, summary
-from bota_ft_compensation.identification.poses import MOST_POSES, Pose, coverage, pose_of
+from bota_ft_compensation.identification.payload import Fit, Identified, TooVagueError, identify, summary
+from bota_ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
 from bota_ft_compensation.identification.weighted import CONFIDENCE
 from bota_ft_compensation.imu import imu_position
 from bota_ft_compensation.quantities import (
     CROSS_AXES,
     ELEMENTS,
     EXACT,
-    Accelerometer,
     CompensationError,
     Wrench,
     length,
@@ -211,14 +210,16 @@ def run(options: argparse.Namespace) -> int:
     if len(periods) > MOST_POSES:
         periods = sorted(sorted(periods, key=lambda period: -period.seconds)[:MOST_POSES])
         _say(f"there are more than {MOST_POSES} poses: the longest are used")
-    poses, result, error = _solve(periods, options)
-    if result is not None:
-        result = _with_inertia(result, motion, sensor)
-    elif coverage([pose for _, pose in poses]).missing is not None:
-        try:
-            result, poses = _in_motion(motion, sensor), ()
-        except CompensationError as refusal:
-            error = f"{error}; or, by motion alone: {refusal}"
+    poses, still, error = _solve(periods, options)
+    try:
+        result: Identified | None = _in_motion(motion, sensor, still)
+        poses = poses if still else ()
+    except CompensationError as refusal:
+        result, alone = None, "with motion" if still else "by motion alone"
+        if still is not None and error is None:
+            note = f"the tool's inertia is not identified: {refusal}"
+            result = still._replace(notes=(note, *still.notes))
+        error = f"{error}; or, {alone}: {refusal}"
     if result is not None:
         _write_files(options, result, sensor, offset)
     if options.json:
@@ -253,6 +254,7 @@ def _write_files(
             f"{who}\n{summary(result)}",
             gravity,
             None if offset is None else Wrench.of(offset),
+            sensor.info.settings,
         )
         _say(f"written to {options.yaml}")
         if offset is None:
@@ -262,36 +264,23 @@ def _write_files(
             )
 
 
-def _with_inertia(result: Identified, motion: _Motion, sensor: RecordedSensor) -> Identified:
-    """The tool's inertia too, as far as the recording has motion."""
-    try:
-        return _inertia(result, motion, sensor)
-    except CompensationError as refusal:
-        return result._replace(notes=(f"the tool's inertia is not identified: {refusal}", *result.notes))
-
-
-def _in_motion(motion: _Motion, sensor: RecordedSensor) -> Identified:
-    """All by free motion, of which no body of negative inertia is a part either; CompensationError."""
-    return _inertia(identify_in_motion(_turned(motion, sensor, EXACT), _imu(sensor)), motion, sensor)
-
-
-def _inertia(result: Identified, motion: _Motion, sensor: RecordedSensor) -> Identified:
-    calibration = result.accelerometer.calibration if result.accelerometer else EXACT
-    return identify_inertia(_turned(motion, sensor, calibration), result)
+def _in_motion(motion: _Motion, sensor: RecordedSensor, poses: Identified | None) -> Identified:
+    """By what the recording has of motion, beside poses or alone; CompensationError."""
+    return identify_in_motion(_turned(motion, sensor), _imu(sensor), poses)
 
 
 def _imu(sensor: RecordedSensor) -> Vector3:
     return imu_position(sensor.info.name)
 
 
-def _turned(motion: _Motion, sensor: RecordedSensor, calibration: Accelerometer) -> Turned:
+def _turned(motion: _Motion, sensor: RecordedSensor) -> Turned:
     if any(row.info.settings != sensor.info.settings for row in sensor.history):
         raise CompensationError("settings were changed during the recording")
     times, rows = motion.rows()
     if not len(times):
         raise CompensationError("no sample can be used")
     alignment = align(sensor.info.settings, sensor.info.rate_hz)
-    return turn(times, rows, alignment, calibration, _imu(sensor))
+    return turn(times, rows, alignment, EXACT, _imu(sensor))
 
 
 def choose(recording: Recording, position: int | None) -> RecordedSensor:
@@ -317,7 +306,7 @@ def choose(recording: Recording, position: int | None) -> RecordedSensor:
 def _solve(
     periods: Sequence[StationaryPeriod], options: argparse.Namespace
 ) -> tuple[Poses, Identified | None, str | None]:
-    """The periods that are poses, and the result or why there is none."""
+    """The periods that are poses, and the result, or why there is none, or why it needs motion."""
     poses: list[tuple[StationaryPeriod, Pose]] = []
     error: str | None = f"the sensor is never stationary for {LEAST_S:g} s: hold it still"
     for period in periods:
@@ -329,5 +318,7 @@ def _solve(
         return poses, None, error
     try:
         return poses, identify([pose for _, pose in poses]), None
+    except TooVagueError as refusal:
+        return poses, refusal.result, str(refusal)
     except CompensationError as refusal:
         return poses, None, str(refusal)

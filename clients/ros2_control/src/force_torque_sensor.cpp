@@ -127,13 +127,12 @@ private:
             log(Level::warning, "the sensor's setting inertia_compensation is on: it subtracts gravity and inertia itself");
         if (parameters_.payload.mass > 0.0) {
             const bool is_known = parameters_.payload.accelerometer_offset != Vector3{};
-            const auto bounds = [this](double spin) {
-                return Bounds(parameters_.payload, parameters_.on_activate_tare, {0, 0, 9.80665}, {}, {spin, 0, 0}, 0.0);
-            };
+            const Bounds known = loop_->bounds();
+            const auto rest = known.at({0, 0, 9.80665}, {}, {}), turning = known.at({0, 0, 9.80665}, {}, {20, 0, 0});
             log(is_known ? Level::info : Level::warning,
                 (is_known ? "the" : "the accelerometer is not identified: use the file of an identification; the") +
-                    std::string(" compensated force may be wrong by ") + detail::text(bounds(0.0).force) + " N, torque by " +
-                    detail::text(bounds(0.0).torque) + " Nm, at 20 rad/s^2 by " + detail::text(bounds(20.0).torque) + " Nm (95 %)");
+                    std::string(" compensated force may be wrong by ") + detail::text(rest[0]) + " N, torque by " + detail::text(rest[1]) +
+                    " Nm, at 20 rad/s^2 by " + detail::text(turning[0]) + " N and " + detail::text(turning[1]) + " Nm (95 % of samples)");
         }
     }
 

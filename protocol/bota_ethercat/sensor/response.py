@@ -140,6 +140,13 @@ def healthy_noise(sinc_length: int, *, fir: bool = False) -> tuple[float, ...]:
     return tuple(passed * deviation * (sinc_length / _NOISE_SINC) ** -power for deviation, power in _NOISE)
 
 
+def noise_ratios(settings: Mapping[str, SettingValue]) -> tuple[float, ...]:
+    """By how much noisier force and torque are with these settings than at SINC 51 with FIR off."""
+    length = int(settings.get("sinc_length") or _NOISE_SINC)
+    found = healthy_noise(length, fir=bool(settings.get("fir")))
+    return tuple(each / deviation for each, (deviation, _) in zip(found, _NOISE, strict=True))
+
+
 def imu_noise(settings: Mapping[str, SettingValue]) -> tuple[float, float]:
     """Standard deviations of acceleration, m/s², and angular rate, rad/s, by known or usual filters."""
     known = {name: settings.get(name) or number for name, number in _IMU_FILTERS.items()}

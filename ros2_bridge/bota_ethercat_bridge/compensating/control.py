@@ -31,6 +31,7 @@ from bota_ft_compensation.quantities import (
     NO_WRENCH,
     STILL,
     Accelerometer,
+    Accuracy,
     Payload,
     Wrench,
     wrench_text,
@@ -43,7 +44,8 @@ _SHOWN: Final = 5e-5  # N, Nm: less is that a file has fewer digits than the sen
 _NOTHING_CURRENT: Final = "no current orientation"
 # What a source depends on.
 _DEPENDS_ON: Final = (
-    "gravity_source", "gravity", "payload", "accelerometer", "imu_position", "orientation_topic",
+    "gravity_source", "gravity", "payload", "accelerometer", "accuracy", "imu_position", "gyroscope_matrix",
+    "orientation_topic",
     "orientation_base_frame", "orientation_mounting", "orientation_stale_after",
 )  # fmt: skip
 
@@ -154,7 +156,7 @@ class CompensationControl:
             "gravity_source": source.name,
             "orientation_age_s": round(age_s, 4) if math.isfinite(age_s) else "",
             "tf_frame_age_s": "" if (tf_age_s := output.frames.age_s) is None else round(tf_age_s, 4),
-            "accelerometer_force": bounds[0],
+            "force_bound": bounds[0],
             "torque_bound": bounds[1],
             "contact": output.contact.why.value if output.contact else "",
             "tared": self.bias != NO_WRENCH,
@@ -222,7 +224,9 @@ class CompensationControl:
             )
             self.set_bias(NO_WRENCH, "cleared")
 
-    def set_payload(self, payload: Payload, bias: Wrench, accelerometer: Accelerometer | None = None) -> None:
+    def set_payload(
+        self, payload: Payload, bias: Wrench, accuracy: Accuracy, accelerometer: Accelerometer | None = None
+    ) -> None:
         """Put an identified payload, its bias and the accelerometer's correction in force, all at once."""
         values: dict[str, Any] = {
             "tool_mass": payload.mass, "tool_center_of_gravity": [*payload.center],
@@ -230,6 +234,7 @@ class CompensationControl:
             "tool_center_of_gravity_interval": [*payload.center_interval],
             "tool_inertia_interval": [*payload.inertia_interval],
         }  # fmt: skip
+        values |= {f"accuracy.{name}": [*part] for name, part in accuracy._asdict().items()}
         if accelerometer is not None:
             values |= {f"accelerometer.{name}": [*part] for name, part in accelerometer._asdict().items()}
         with self._setting:
@@ -246,7 +251,9 @@ class CompensationControl:
         parameters = self.parameters
         with self._replacing:
             ramp = change(self._ramp)
-            self.output.stream.plan = Plan(self.source, parameters.payload, ramp, parameters.accelerometer)
+            self.output.stream.plan = Plan(
+                self.source, parameters.payload, ramp, parameters.accelerometer, parameters.accuracy
+            )
             self.output.stream.check()
 
     def _apply_changes(self, ramp: BiasRamp) -> BiasRamp:

@@ -101,7 +101,8 @@ def check_source(node: Node, wanted: Parameters) -> None:
 def open_source(node: Node, wanted: Parameters, group: CallbackGroup) -> Source:
     """The source that is wanted; ParameterError if that cannot be."""
     if wanted.gravity_source == "imu":
-        return ImuSource(wanted.tool_center_of_gravity, wanted.imu_position, wanted.accelerometer)
+        place, gyroscope = wanted.imu_position, wanted.gyroscope_matrix
+        return ImuSource(wanted.tool_center_of_gravity, place, wanted.accelerometer, gyroscope)
     if wanted.gravity_source == "tf":
         return _open_tf(node, wanted, group)
     return Source() if wanted.gravity_source == "none" else _open_topic(node, wanted, group)

@@ -26,10 +26,13 @@ from bota_ft_compensation.outputs import LEAST_CUTOFF_HZ, WrenchTransform
 from bota_ft_compensation.quantities import (
     DEFAULT_GRAVITY,
     EXACT,
+    IDENTITY,
     NO_PAYLOAD,
     NORM_TOLERANCE,
+    UNKNOWN_ACCURACY,
     ZERO,
     Accelerometer,
+    Accuracy,
     CompensationError,
     Payload,
     Quaternion,
@@ -44,7 +47,9 @@ AUTO: Final = "auto"  # the value of a path that is for the node to choose
 TOPIC_SOURCES: Final = ("topic_pose", "topic_quaternion", "topic_imu")
 _PORT: Final = 12001
 _LEAST_GRAVITY: Final = 0.1
-_GROUPS: Final = re.compile("^(diagnostics|orientation(?!_cov)|accelerometer|rest|filter|contact|identify)_")
+_GROUPS: Final = re.compile(
+    "^(diagnostics|orientation(?!_cov)|accelerometer|accuracy|rest|filter|contact|identify)_"
+)
 _FRAME_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _REST: Final = StationaryLimits()
 
@@ -200,6 +205,14 @@ class Parameters:
         "Parts of other axes to subtract: xy xz yx yz zx zy; ~/identify finds them", 0, 1)
     accelerometer_cross_axis_interval: Numbers = _row(EXACT.cross_axis_interval,
         "Half of their 95 % intervals; ~/identify finds them", 0, 1)
+    gyroscope_matrix: Numbers = _row(IDENTITY,
+        "What angular rates are multiplied with, row by row; ethercat-identify finds it", 0, 2)
+    accuracy_noise: Numbers = _row(UNKNOWN_ACCURACY.noise,
+        "Standard deviations of a sample at SINC 51 with FIR off, N and Nm; 0 = of the latest tare, or of a "
+        "healthy sensor; ~/identify finds them", 0, 1e3)
+    accuracy_left: Numbers = _row(UNKNOWN_ACCURACY.left,
+        "What identified tool and IMU leave on each axis: N in any pose, N per m/s², N per rad/s², likewise "
+        "Nm; 0 = by the intervals; ethercat-identify finds it", 0, 1e3)
     rest_duration: float = _row(1.0, "Seconds that ~/tare and ~/identify/add_pose take samples for", 0.05, 60)
     rest_force_deviation: float = _row(_REST.force_deviation, "Largest standard deviation at rest, N", 0, 1e3)
     rest_torque_deviation: float = _row(_REST.torque_deviation,
@@ -241,6 +254,10 @@ class Parameters:
     @cached_property
     def accelerometer(self) -> Accelerometer:
         return Accelerometer(**self._group("accelerometer_"))
+
+    @cached_property
+    def accuracy(self) -> Accuracy:
+        return Accuracy(**self._group("accuracy_"))
 
     @cached_property
     def rest(self) -> StationaryLimits:

@@ -39,7 +39,6 @@ class ContactTopic(WrenchTopic):
         self._stamps, self.index = stamps, Stages._fields.index("final")
         self._detected = create_publisher(node, Bool, "contact/detected")
         self._stream = stream
-        self.noise: tuple[float, ...] = ()  # of the latest tare, N and Nm
         self.why = Why.NO_CONTACT  # of the latest point
         self._detector: ContactDetector | None = None
         self._made_of: object = None
@@ -58,14 +57,15 @@ class ContactTopic(WrenchTopic):
     def _follow(self, parameters: Parameters) -> None:
         """Another detector where parameters, bias or settings are others."""
         plan, info = self._stream.plan, self._stream.in_force.info
-        made_of = parameters, plan.ramp.taken, plan.source.is_imu, info.settings, info.rate_hz, self.noise
+        made_of = parameters, plan.ramp.taken, plan.source.is_imu, info.settings, info.rate_hz
         if made_of == self._made_of:
             return
         self._made_of = made_of
         surface = parse_surface(parameters.contact_surface)
         assert surface is not None  # there is no topic without one
-        noise = parameters.contact_noise if any(parameters.contact_noise) else self.noise
-        self._detector = self._stream.contact_detector(surface, noise, parameters.contact_false_alarms)
+        self._detector = self._stream.contact_detector(
+            surface, parameters.contact_noise, parameters.contact_false_alarms
+        )
 
     def send(self, force: Vector3, torque: Vector3, frame: DataMessage) -> None:
         if (detector := self._detector) is None:

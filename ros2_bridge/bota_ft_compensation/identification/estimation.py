@@ -26,11 +26,12 @@ from bota_ft_compensation.identification.weighted import (
     solve,
     students_t,
 )
-from bota_ft_compensation.quantities import OFFSET_PRIOR, SCALE_PRIOR
+from bota_ft_compensation.quantities import NORMAL_95, OFFSET_PRIOR, SCALE_PRIOR
 
 # m/s²: what is assumed of the length of a mean acceleration beyond offset and sensitivities, ...
-_LENGTH_DEVIATION: Final = 0.002
+_LENGTH_DEVIATION: Final = 0.001
 _LENGTH_DEGREES: Final = 6.0  # ... as if it were estimated from so many residuals.
+_NOISE_DEGREES: Final = 30.0  # likewise of force and torque, where the windows' noise explains what is left
 # N, Nm, m/s²: standard deviations below which nothing is believed, where equations of all kinds meet.
 _FLOOR: Final = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4])
 _FLOOR_ALONE: Final = 1e-12
@@ -38,11 +39,11 @@ _FLOOR_ALONE: Final = 1e-12
 # perfectly by an offset that they hardly determine.
 _LEAST_SHARE: Final = 0.3
 _MOUNTING: Final = 0.01  # rad: standard deviation of the mounting about each axis
+CHIP_TURN: Final = 0.03  # rad: likewise of the IMU's chip, against force and torque
 _NOTHING: Final = 1e-9  # kg: no mass at all has its center anywhere
 _OF_CALIBRATION: Final = 12  # unknowns: offset, scale - 1, cross-axis terms
 _FIXED: Final = 1e-7  # standard deviation of what is not free
 CROSS_ROW, CROSS_COLUMN = np.nonzero(~np.eye(3, dtype=bool))  # of the cross-axis terms, as CROSS_AXES
-_TRANSPOSED: Final = [2, 4, 0, 5, 1, 3]  # of each, the one that a rotation makes its opposite
 _LENGTH_ROUNDS: Final = 3
 _ROUNDS: Final = 9
 _CONVERGED: Final = 1e-7
@@ -52,14 +53,14 @@ def calibration_prior(*, scale: bool = False, turn: bool = False, crossed: bool 
     """(12, 12), the information that is assumed in advance of the calibration, of which the offset is fitted,
     and what is given here; `turn`: the accelerometer as a whole, about each axis.
     """
-    deviations = [OFFSET_PRIOR] * 3 + [SCALE_PRIOR if scale else _FIXED] * 3
-    prior = np.diag(np.array(deviations + [SCALE_PRIOR if crossed else _FIXED] * 6) ** -2)
-    if turn and not crossed:
-        even, odd = np.eye(6) + np.eye(6)[_TRANSPOSED], np.eye(6) - np.eye(6)[_TRANSPOSED]
-        prior[6:, 6:] = 0.5 * _FIXED**-2 * even + 0.25 * _MOUNTING**-2 * odd
-    return prior
+    variances = np.diag([OFFSET_PRIOR**2] * 3 + [SCALE_PRIOR**2 if scale else _FIXED**2] * 3 + [0.0] * 6)
+    own = SCALE_PRIOR if crossed else _FIXED
+    variances[6:, 6:] = own**2 * np.eye(6) + (CHIP_TURN**2 * OF_TURN @ OF_TURN.T if turn or crossed else 0.0)
+    return np.linalg.inv(variances)
 
 
+# (6, 3): of the cross-axis terms, what a chip that is turned by a small rotation vector makes of them.
+OF_TURN: Final = -np.cross(np.eye(3), np.eye(3)[:, np.newaxis])[CROSS_COLUMN, :, CROSS_ROW]
 FULL_CALIBRATION: Final = calibration_prior(scale=True, crossed=True)
 
 
@@ -83,6 +84,10 @@ class Estimate(NamedTuple):
     residuals: Array  # (n, 6), N and Nm: measured minus modelled
     degrees: Array  # (6,): degrees of freedom of the residuals of each axis
     excess: Array  # (n,), m/s²: by how much gravity is longer than the corrected acceleration; zeros without
+    # Mass, bias force, moment, bias torque, and calibration or mounting, and their covariance, with Student's
+    # t in it, so that it is that of normal errors.
+    unknowns: Array
+    covariance: Array
 
 
 def estimate(
@@ -94,12 +99,14 @@ def estimate(
     *,
     is_turned: bool = False,
     prior: Array = FULL_CALIBRATION,
+    noise: Array | None = None,
 ) -> Estimate:
     """Solve the poses: wrench (..., n, 6), N and Nm, and gravity (..., n, 3), in the sensor's frame, m/s².
 
     Also `acceleration` (..., n, 3), m/s², if gravity is from it, with `acceleration_variance` (...,) of its
     means by the sensor's noise, (m/s²)², of whose calibration `prior` is assumed; or `is_turned` to have the
-    mounting found; and the `regressor` (..., n). LinAlgError if an unknown is open.
+    mounting found; and the `regressor` (..., n). `noise` (6,): variances of the six axes that explain what
+    is left, and so are assumed. LinAlgError if an unknown is open.
     """
     if regressor is not None:  # of several regressors, each is a problem
         many = regressor.shape[:-1]
@@ -116,7 +123,7 @@ def estimate(
             solution = _alone(gravity, measured, regressor)
     else:
         gravity, solution, excess = _with_accelerometer(
-            measured, acceleration, gravity, acceleration_variance, regressor, prior
+            measured, acceleration, gravity, acceleration_variance, regressor, prior, noise
         )
     answer, unknowns = solution.answer, solution.answer.shape[-1]
     mass = answer[..., :1]
@@ -128,6 +135,9 @@ def estimate(
     rows[..., 4:7, 0] = -center / divisor
     deviation, degrees = solution.student(rows)
     half = students_t(degrees) * deviation
+    wider = students_t(solution.student(np.broadcast_to(np.eye(unknowns), rows.shape))[1]) / NORMAL_95
+    kept = [*range(10), *range(10 if regressor is None else 16, unknowns)]
+    covariance = solution.covariance * wider[..., np.newaxis] * wider[..., np.newaxis, :]
     linear = 10
     if regressor is not None:
         linear = 16
@@ -154,6 +164,8 @@ def estimate(
         wrench - np.swapaxes(_times(_design(gravity, regressor), answer[..., :linear]), -1, -2),
         solution.degrees[..., :6],
         excess,
+        answer[..., kept],
+        covariance[..., kept, :][..., kept],
     )
 
 
@@ -198,20 +210,26 @@ class _Linear(NamedTuple):
     excess: Array  # (..., 1, n): by how much gravity is longer than u
 
 
-def _linearize(acceleration: Array, size: Array, calibration: Array) -> _Linear:
-    """About `calibration` (..., 12). `size` (..., n) is the magnitude of gravity."""
+def corrected(acceleration: Array, calibration: Array) -> tuple[Array, Array]:
+    """(..., n, 3) the truth of what was read, by `calibration` (..., 12), and (..., n, 3, 12) its change."""
     offset, scale = calibration[..., np.newaxis, :3], 1.0 + calibration[..., np.newaxis, 3:6]
     crossed = np.zeros((*calibration.shape[:-1], 3, 3))
     crossed[..., CROSS_ROW, CROSS_COLUMN] = calibration[..., 6:]
     straight = (np.eye(3) - crossed)[..., np.newaxis, :, :]
     v = (acceleration - offset) / scale
     u = (straight @ v[..., np.newaxis])[..., 0]
-    length = np.linalg.norm(u, axis=-1)
-    up = u / length[..., np.newaxis]
     change = np.zeros((*u.shape, _OF_CALIBRATION))
     change[..., :3] = -straight / scale[..., np.newaxis, :]
     change[..., 3:6] = -straight * (v / scale)[..., np.newaxis, :]
     change[..., CROSS_ROW, 6 + np.arange(6)] = -v[..., CROSS_COLUMN]
+    return u, change
+
+
+def _linearize(acceleration: Array, size: Array, calibration: Array) -> _Linear:
+    """About `calibration` (..., 12). `size` (..., n) is the magnitude of gravity."""
+    u, change = corrected(acceleration, calibration)
+    length = np.linalg.norm(u, axis=-1)
+    up = u / length[..., np.newaxis]
     along = (up[..., np.newaxis, :] @ change)[..., 0, :]
     across = change - up[..., np.newaxis] * along[..., np.newaxis, :]
     return _Linear(
@@ -229,6 +247,7 @@ def _with_accelerometer(
     noise: Array | float,
     regressor: Array | None,
     prior: Array,
+    explained: Array | None,
 ) -> tuple[Array, Solution, Array]:
     """Gravity (..., n, 3), the unknowns, those of the calibration last, and `excess`; by Gauss and Newton.
 
@@ -238,6 +257,8 @@ def _with_accelerometer(
     assumed = np.zeros((*measured.shape[:-2], 7))
     assumed[..., 6] = _LENGTH_DEVIATION**2 + noise
     degrees = np.array([0.0] * 6 + [_LENGTH_DEGREES])
+    if explained is not None:
+        assumed[..., :6], degrees[:6] = explained, _NOISE_DEGREES
     lengths = Known(prior, _FLOOR[6:] ** 2, degrees[6:], assumed[..., 6:])
     calibration = np.zeros((*measured.shape[:-2], _OF_CALIBRATION))
     for _ in range(_LENGTH_ROUNDS):
@@ -252,7 +273,8 @@ def _with_accelerometer(
     unknowns = answer.shape[-1]
     information = np.zeros((unknowns, unknowns))
     information[linear:, linear:] = prior
-    known = Known(information, np.maximum(_LEAST_SHARE * variances, _FLOOR**2), degrees, assumed)
+    least = _LEAST_SHARE * variances if explained is None else 0.0
+    known = Known(information, np.maximum(least, _FLOOR**2), degrees, assumed)
     for _ in range(_ROUNDS):
         design = np.zeros((*measured.shape[:-2], 7, measured.shape[-1], unknowns))
         design[..., :6, :, :linear] = _design(at.gravity, regressor)

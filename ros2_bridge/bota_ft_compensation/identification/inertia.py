@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tool's inertia tensor about its center of gravity, from a recording in which the tool turned freely.
+"""A recording in which the tool turned: force, torque and what the IMU felt, at one instant and bandwidth.
 
-In every sample torque = center x tool's force + bias - (J alpha + omega x J omega), with angular rate and
-acceleration as the compensation has them: at the instant and with the bandwidth of the force. This is linear
-in J, the center, and a bias that drifts. What mass and center make likely of J is known before, and remains
-where the motion tells nothing. Samples in which force and accelerometer disagree, as while a hand moves the
-tool from pose to pose, are left out. The covariance is that of pieces of the recording (sandwich), and so
-covers residuals that are correlated.
+What `free_motion` and its tests need of samples: smoothed instants, those in which something touched the tool
+left out, as while a hand moves it from pose to pose, and least squares whose covariance is that of pieces of
+the recording (sandwich), and so covers residuals that are correlated.
 """
 
 from __future__ import annotations
@@ -18,22 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bota_ethercat.pdo import Vector3
-from bota_ethercat.sensor.response import acceleration_response, angular_rate_response, fir_taps
+from bota_ethercat.sensor.response import acceleration_response, angular_rate_response, fir_taps, imu_noise
 from bota_ft_compensation.alignment import Alignment, Array
-from bota_ft_compensation.identification.payload import Identified
 from bota_ft_compensation.identification.resampling import (
     at_times,
     hann_window,
     smoothed,
     stretches,
 )
-from bota_ft_compensation.identification.weighted import students_t
 from bota_ft_compensation.quantities import (
     ELEMENTS,
-    NORMAL_95,
     Accelerometer,
     CompensationError,
-    likely_inertia,
 )
 
 _RESPONSES: Final = acceleration_response, angular_rate_response
@@ -51,7 +44,7 @@ _LEAST_CENTER: Final = 5e-4  # m: how well poses tell the center of gravity of w
 _GYROSCOPE: Final = 0.01  # tolerance of its sensitivity, 95 %
 _HARDLY: Final = 0.5  # of the interval before: a moment no better known than so is not determined
 _AT_FIRST: Final = 1e6  # weights: what is measured goes first, not what was known before
-_PLACES: Final = [("xyz".index(row), "xyz".index(column)) for row, column in ELEMENTS]
+PLACES: Final = [("xyz".index(row), "xyz".index(column)) for row, column in ELEMENTS]
 
 
 class Turned(NamedTuple):
@@ -63,6 +56,10 @@ class Turned(NamedTuple):
     arm: Array  # (n, 3, 3): times a place in the sensor's frame, m: by how much it is another there
     spun: Array  # (n, 3, 6): times the tensor: J alpha + omega x J omega
     times: Array  # (n,) s; none where a sample is missing
+    # Deviations of force and torque, of single samples by those of smoothed ones, and what of a sample's
+    # acceleration, m/s², is noise.
+    noisier: float = 1.0
+    imu_noise: float = 0.0
 
 
 def turn(
@@ -107,7 +104,10 @@ def turn(
     _check_imu(moved, period)
     force, torque, felt, arm, spun = np.split(np.concatenate(found), [3, 6, 9, 18], axis=1)
     times = np.concatenate(instants)
-    return Turned(force, torque, felt, arm.reshape(-1, 3, 3), spun.reshape(-1, 3, 6), times)
+    return Turned(
+        force, torque, felt, arm.reshape(-1, 3, 3), spun.reshape(-1, 3, 6), times,
+        1.0 / float(np.linalg.norm(window)), imu_noise(settings)[0] * float(np.linalg.norm(taps)),
+    )  # fmt: skip
 
 
 def _check_imu(moved: Sequence[tuple[Array, ...]], period: float) -> None:
@@ -143,38 +143,6 @@ def _check_imu(moved: Sequence[tuple[Array, ...]], period: float) -> None:
         )
 
 
-def identify_inertia(turned: Turned, poses: Identified) -> Identified:
-    """`poses` with the tensor and its intervals, and a note where the motion does not tell it.
-
-    CompensationError, one sentence, if there is no such body.
-    """
-    payload, weight = poses.payload, poses.payload.mass * poses.gravity
-    felt = turned.felt + turned.arm @ np.array(payload.center)
-    beyond = np.linalg.norm(turned.force - poses.bias.force + payload.mass * felt, axis=1)
-    is_free = untouched(turned, beyond, weight)
-    minutes, pieces, spun = divided(turned)
-    if len(np.unique(pieces[is_free])) <= _LEAST_PIECES:
-        raise CompensationError("something touched the tool all the time between the poses")
-    still = np.broadcast_to(np.eye(3), (len(pieces), 3, 3))
-    force = -payload.mass * felt  # with far less noise than the measured one
-    design = np.concatenate([-spun, -crossing(force), still, still * minutes], axis=2)[is_free]
-    likely, half = (np.array(part) for part in likely_inertia(payload))
-    halves = np.concatenate([half, np.maximum(payload.center_interval, _LEAST_CENTER), np.full(6, np.inf)])
-    known, expected = (NORMAL_95 / halves) ** 2, np.concatenate([likely, payload.center, np.zeros(6)])
-    measured, pieces = turned.torque[is_free], pieces[is_free]
-    found, covariance, degrees = solve_pieces(design, measured, pieces, known, expected)
-    found, interval = found[:6], float(students_t(degrees)) * np.sqrt(np.diag(covariance)[:6])
-    interval = np.hypot(np.minimum(interval, half), _GYROSCOPE * abs(found[:3]).max())
-    vague = "".join(axis for axis, is_open in zip("xyz", interval > _HARDLY * half, strict=False) if is_open)
-    note = (
-        f"the tool hardly turned about {' and '.join(vague)}, so its inertia there is only what mass and "
-        "center of gravity make likely: turn it to and fro about each axis for some seconds, touching nothing"
-    )
-    inertia = possible_inertia(found, interval).tolist()
-    payload = payload._replace(inertia=tuple(inertia), inertia_interval=tuple(interval.tolist()))
-    return poses._replace(payload=payload, notes=(*([note] if vague else []), *poses.notes))
-
-
 def untouched(turned: Turned, beyond: Array, weight: float) -> NDArray[np.bool_]:
     """(n,): so much force, N, that the tool does not explain is no contact."""
     spread = max(1, round(_AROUND_S / float(np.diff(turned.times[:2])[0])))
@@ -192,24 +160,24 @@ def divided(turned: Turned) -> tuple[Array, NDArray[np.int64], Array]:
 
 
 def solve_pieces(
-    design: Array, measured: Array, pieces: NDArray[np.int64], known: Array, expected: Array
+    design: Array, measured: Array, pieces: NDArray[np.int64], known: Array, towards: Array
 ) -> tuple[Array, Array, float]:
     """The unknowns (p,) of `design` (n, k, p) times unknowns = `measured` (n, k), covariance and degrees.
 
-    `pieces` (n,) numbers those whose residuals are correlated. `known` (p,): inverse of the variance about
-    `expected` that was known before.
+    `pieces` (n,) numbers those whose residuals are correlated. `known` (p, p): inverse of the covariance that
+    was known before, and `towards` (p,): times what was expected.
     """
     pieces = np.unique(pieces, return_inverse=True)[1]
     (_, kinds, unknowns), count = design.shape, int(pieces[-1]) + 1
     scale = np.sqrt((design**2).mean(axis=(0, 1)))
     scale[scale == 0.0] = 1.0  # of what the motion does not show at all
-    design, known, expected = design / scale, known / scale**2, expected * scale
+    design, known, towards = design / scale, known / np.outer(scale, scale), towards / scale
     weights = np.full(kinds, _AT_FIRST)
     for _ in range(3):
         weighted = design * weights[:, None]
-        information = np.tensordot(weighted, design, ([0, 1], [0, 1])) + np.diag(known)
-        right = np.tensordot(weighted, measured, ([0, 1], [0, 1])) + known * expected
-        answer = np.linalg.lstsq(information, right, rcond=1e-12)[0]
+        information = np.tensordot(weighted, design, ([0, 1], [0, 1])) + known
+        right = np.tensordot(weighted, measured, ([0, 1], [0, 1])) + towards
+        answer = np.linalg.lstsq(information, right, rcond=1e-15)[0]
         residuals = measured - design @ answer
         # Neighboring instants tell the same: so many as a piece has count as one.
         weights = 1.0 / (np.maximum((residuals**2).mean(axis=0), 1e-12) * 2.0)
@@ -217,8 +185,8 @@ def solve_pieces(
     np.add.at(scores, pieces, np.einsum("nip,ni->np", design * weights[:, None], residuals))
     degrees = max(count - unknowns / kinds, 1.0)
     meat = scores.T @ scores * count / degrees
-    inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
-    covariance = inverse @ (meat + np.diag(known)) @ inverse
+    inverse = np.linalg.pinv(information, rcond=1e-15, hermitian=True)
+    covariance = inverse @ (meat + known) @ inverse
     return answer / scale, covariance / np.outer(scale, scale), degrees
 
 
@@ -229,7 +197,7 @@ def possible_inertia(found: Array, interval: Array) -> Array:
     moments are positive, and none larger than the sum of the others.
     """
     tensor = np.zeros((3, 3))
-    for (i, j), value in zip(_PLACES, found, strict=True):
+    for (i, j), value in zip(PLACES, found, strict=True):
         tensor[i, j] = tensor[j, i] = value
     spread, axes = np.linalg.eigh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
     if spread[0] < -np.linalg.norm(interval):
@@ -240,7 +208,7 @@ def possible_inertia(found: Array, interval: Array) -> Array:
         )
     spread = np.maximum(spread, 0.0)
     tensor = spread.sum() * np.eye(3) - (axes * spread) @ axes.T
-    return np.array([tensor[i, j] for i, j in _PLACES])
+    return np.array([tensor[i, j] for i, j in PLACES])
 
 
 def crossing(vectors: Array) -> Array:
@@ -254,7 +222,7 @@ def crossing(vectors: Array) -> Array:
 def _elements(vectors: Array) -> Array:
     """(n, 3, 6): times the elements of a symmetric tensor, that tensor times the vector."""
     found = np.zeros((len(vectors), 3, 6))
-    for element, (i, j) in enumerate(_PLACES):
+    for element, (i, j) in enumerate(PLACES):
         found[:, i, element] = vectors[:, j]
         found[:, j, element] = vectors[:, i]
     return found

@@ -6,19 +6,23 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from bota_ethercat.pdo import Vector3
 from bota_ethercat.program.new_file import NewFile
+from bota_ethercat.settings import SettingValue
 from bota_ft_compensation.bias import BiasRamp
 from bota_ft_compensation.identification.payload import Identified
 from bota_ft_compensation.imu import ImuSource
 from bota_ft_compensation.quantities import (
     EXACT,
+    IDENTITY,
     NO_PAYLOAD,
     NO_WRENCH,
     ZERO,
     Accelerometer,
+    Accuracy,
     Payload,
     Wrench,
 )
@@ -33,13 +37,14 @@ def write_yaml(
     comment: str = "",
     gravity: Vector3 | None = None,
     offset: Wrench | None = None,
+    settings: Mapping[str, SettingValue] = MappingProxyType({}),
 ) -> None:
     """Write what was identified, or replace it, with `comment` on top; FileError if that fails.
 
     `offset` is the sensor's own, with which the bias was measured; None: not known.
 
     `gravity` is in the base frame, m/s²; without it the file does not say how the base stands. Where the
-    accelerometer was not identified, the file leaves it alone.
+    accelerometer was not identified, the file leaves it alone. `settings` are those of the samples.
     """
     rows: list[_Row] = [("bias", result.bias.values, "N, Nm: Fx Fy Fz Mx My Mz, subtracted")]
     if offset is not None:
@@ -53,6 +58,13 @@ def write_yaml(
         )  # fmt: skip
         parts = zip(result.accelerometer.calibration._asdict().items(), units, strict=True)
         rows += [(f"accelerometer.{name}", part, unit) for (name, part), unit in parts]
+    if result.gyroscope != IDENTITY:
+        rows.append(("gyroscope_matrix", result.gyroscope, "angular rates are this times what is read"))
+        rows.append(("imu_position", result.imu, "m, in the sensor's frame"))
+    left = "deviations on each axis: N in any pose, N for each m/s² and rad/s²; Nm likewise"
+    accuracy = result.accuracy(settings)
+    rows.append(("accuracy.noise", accuracy.noise, "N, Nm: deviations of a sample at SINC 51 with FIR off"))
+    rows.append(("accuracy.left", accuracy.left, left))
     write_payload(path, result.payload, comment, rows)
 
 
@@ -89,8 +101,12 @@ def stream_of(parameters: Mapping[str, Any]) -> CompensatedStream:
     payload, bias = payload_of(parameters), Wrench.of(parameters.get("bias", NO_WRENCH.values))
     rows = {name: parameters.get(f"accelerometer.{name}", row) for name, row in EXACT._asdict().items()}
     accelerometer = Accelerometer(**{name: tuple(row) for name, row in rows.items()})
-    source = ImuSource(payload.center, tuple(parameters.get("imu_position", ZERO)), accelerometer)
-    stream = CompensatedStream(Plan(source, payload, BiasRamp(bias), accelerometer), use_saturated=False)
+    position, gyroscope = parameters.get("imu_position", ZERO), parameters.get("gyroscope_matrix", IDENTITY)
+    source = ImuSource(payload.center, tuple(position), accelerometer, tuple(gyroscope))
+    rows = {name: parameters.get(f"accuracy.{name}", row) for name, row in Accuracy()._asdict().items()}
+    accuracy = Accuracy(**{name: tuple(row) for name, row in rows.items()})
+    plan = Plan(source, payload, BiasRamp(bias), accelerometer, accuracy)
+    stream = CompensatedStream(plan, use_saturated=False)
     offset = offset_of(parameters)
     stream.own_offset.begin(bias, offset, is_measured=offset is not None)
     return stream

@@ -10,12 +10,15 @@ is found: by an F test, once that time or the pose's indicator is one more regre
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
+from bota_ethercat.settings import SettingValue
+from bota_ft_compensation.bounds import at_reference
 from bota_ft_compensation.identification.estimation import (
     FULL_CALIBRATION,
     Estimate,
@@ -26,12 +29,17 @@ from bota_ft_compensation.identification.estimation import (
 from bota_ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
 from bota_ft_compensation.identification.weighted import CONFIDENCE, Array
 from bota_ft_compensation.quantities import (
+    IDENTITY,
     NORMAL_95,
     OFFSET_PRIOR,
     SCALE_PRIOR,
+    ZERO,
     Accelerometer,
+    Accuracy,
     CompensationError,
+    Matrix,
     Payload,
+    Six,
     Wrench,
     length,
     likely_inertia,
@@ -72,6 +80,14 @@ class IdentificationError(CompensationError):
     """The poses do not give an answer; the text is one sentence that says why and what to do."""
 
 
+class TooVagueError(IdentificationError):
+    """The intervals are too wide; motion may tell more."""
+
+    def __init__(self, text: str, result: Identified) -> None:
+        super().__init__(text)
+        self.result = result
+
+
 class Fit(NamedTuple):
     rms: float  # of the residuals, with the degrees of freedom taken into account, N or Nm
     degrees: float  # of freedom
@@ -88,6 +104,13 @@ class OffsetFit(NamedTuple):
     calibration: Accelerometer
     undetermined: str  # axes whose offset the poses do not determine: "", "x", ...
     model: str = ""  # what was fitted of it, and why, a phrase; empty: all, and nothing else was tried
+
+
+class Joint(NamedTuple):
+    """What poses say together, of mass, bias force, m times the center, bias torque and accelerometer."""
+
+    unknowns: Array  # (22,)
+    covariance: Array  # (22, 22)
 
 
 class Identified(NamedTuple):
@@ -110,6 +133,16 @@ class Identified(NamedTuple):
     # Of the bias, a minute; None if time explains nothing. `bias` is that of the last pose then.
     drift: Wrench | None = None
     touched: int | None = None  # index of the pose that does not fit the others, and is left out
+    joint: Joint | None = None  # None where gravity is not from the accelerometer
+    # Of one sample's force, N, and torque, Nm, with the filters that were set; zeros: not known.
+    noise: tuple[float, ...] = (0.0,) * 6
+    left: Six = (0.0,) * 6  # as `Accuracy.left`
+    gyroscope: Matrix = IDENTITY  # angular rates are this times what is read
+    imu: Vector3 = ZERO  # its place, m; zeros: not identified
+
+    def accuracy(self, settings: Mapping[str, SettingValue]) -> Accuracy:
+        """With these filters."""
+        return Accuracy(at_reference(self.noise, settings), self.left)
 
 
 def identify(poses: Sequence[Pose]) -> Identified:
@@ -131,13 +164,17 @@ def identify(poses: Sequence[Pose]) -> Identified:
         raise IdentificationError(f"the poses do not suffice: {seen.missing}; {seen.next_pose}")
     equations = _Equations(poses)
     try:
-        model, every = equations.choose()
+        model = equations.choose()
         whole, drift, touched = _explained(equations)
+        found, kept, shift = whole, np.ones(len(poses), bool), None
+        if touched is not None:
+            found, kept[touched.pose], shift = touched.rest, False, np.eye(len(poses))[touched.pose]
+        elif drift is not None:
+            shift = equations.minutes
+        found, noise = equations.by_noise(found, kept, shift)
+        every = equations.with_all(shift, noise)
     except np.linalg.LinAlgError:
         raise IdentificationError("the poses do not suffice: their equations leave an unknown open") from None
-    found, kept = whole, np.ones(len(poses), bool)
-    if touched is not None:
-        found, kept[touched.pose] = touched.rest, False
     mass, mass_interval = float(found.mass.value[0]), float(found.mass.half[0])
     check_mass(mass, mass_interval)
     payload = Payload(mass, triple(found.center.value), center_interval=triple(found.center.half))
@@ -152,11 +189,9 @@ def identify(poses: Sequence[Pose]) -> Identified:
     _check_fit(_residual(whole.residuals[:, :3], whole.degrees[:3]), touched, most_force, "N")
     check_center(payload)
     _check_fit(_residual(whole.residuals[:, 3:], whole.degrees[3:]), touched, most_torque, "Nm")
-    if why := too_vague(payload, mass_interval, gravity):
-        raise IdentificationError(f"the poses {why}; {seen.next_pose if touched is None else touched}")
     accelerometer = accelerometer_of(_with_unfitted(found.calibration, every), model)
     undetermined = accelerometer.undetermined if accelerometer else ""
-    return Identified(
+    result = Identified(
         payload,
         Wrench.of(found.bias.value.tolist()),
         gravity,
@@ -176,7 +211,12 @@ def identify(poses: Sequence[Pose]) -> Identified:
         accelerometer,
         drift,
         None if touched is None else touched.pose,
+        Joint(every.unknowns, every.covariance) if every and every.calibration else None,
+        tuple(np.sqrt((equations.spread**2).mean(axis=0)).tolist()),
     )
+    if why := too_vague(payload, mass_interval, gravity):
+        raise TooVagueError(f"the poses {why}; {seen.next_pose if touched is None else touched}", result)
+    return result
 
 
 class _Equations:
@@ -192,6 +232,8 @@ class _Equations:
         self._noise = float(
             np.mean([length(pose.acceleration_spread) ** 2 / 3.0 / pose.samples for pose in poses])
         )
+        self.spread = np.array([[*pose.force_spread, *pose.torque_spread] for pose in poses])
+        self._samples = np.array([[pose.samples] for pose in poses])
         times = [pose.time_s for pose in poses if pose.time_s is not None]
         # Minutes before the last pose; None if they say nothing.
         self.minutes: Array | None = None
@@ -200,11 +242,11 @@ class _Equations:
 
         self._is_turned, self._prior = False, FULL_CALIBRATION
 
-    def choose(self) -> tuple[str, Estimate | None]:
-        """Fit as much of the accelerometer as the poses tell: what that is, and the answer with all of it."""
+    def choose(self) -> str:
+        """Fit as much of the accelerometer as the poses tell: what that is, for people."""
         count = len(self.wrench)
         if self._acceleration is None or count < _FEWEST_IN_TIME:
-            return "", None
+            return ""
         left_out, errors = np.eye(count)[:: math.ceil(count / _LEFT_OUT)], {}
         for name, self._prior in _MODELS.items():
             found = self.solve(left_out)
@@ -212,15 +254,35 @@ class _Equations:
             longer = found.mass.value * (found.excess * left_out).sum(axis=-1, keepdims=True)
             off = np.concatenate([found.shift.value[:, :3], longer], axis=1)
             errors[name] = float(np.median(np.linalg.norm(off, axis=1)))  # whatever touched some of them
-        every, most = self.solve(), _AS_GOOD * min(errors.values())
+        most = _AS_GOOD * min(errors.values())
         chosen = next(name for name, error in errors.items() if error <= most)
         self._prior = _MODELS[chosen]
         rest = ", ".join(f"{error:.3g} N with {name}" for name, error in errors.items() if name != chosen)
-        return f"{chosen} fitted: a pose that is left out is off by {errors[chosen]:.3g} N ({rest})", every
+        return f"{chosen} fitted: a pose that is left out is off by {errors[chosen]:.3g} N ({rest})"
 
-    def solve(self, regressor: Array | None = None) -> Estimate:
+    def with_all(self, regressor: Array | None, noise: Array | None) -> Estimate | None:
+        """The answer with all that an accelerometer may have."""
+        self._prior = FULL_CALIBRATION
+        return None if self._acceleration is None else self.solve(regressor, noise)
+
+    def by_noise(
+        self, found: Estimate, kept: NDArray[np.bool_], regressor: Array | None
+    ) -> tuple[Estimate, Array | None]:
+        """The answer if axes vary by the windows' noise, (6,), which it is too; or what was `found`, None."""
+        directions = float(found.mass.value[0]) ** 2 * self._noise * (self._acceleration is not None)
+        arms = np.concatenate([np.ones(3), ((found.center.value**2).sum() - found.center.value**2) / 2])
+        expected = (self.spread**2 / self._samples).mean(axis=0) + directions * arms
+        if not self.spread.all():
+            return found, None
+        result = self.solve(regressor, expected)
+        degrees = max(float(result.degrees.sum()), 1.0)
+        if float((result.residuals[kept] ** 2 / expected).sum()) > degrees * _rarely(degrees):
+            return found, None
+        return result, expected
+
+    def solve(self, regressor: Array | None = None, noise: Array | None = None) -> Estimate:
         given = self.wrench, self.gravity, self._acceleration, self._noise, regressor
-        return estimate(*given, is_turned=self._is_turned, prior=self._prior)
+        return estimate(*given, is_turned=self._is_turned, prior=self._prior, noise=noise)
 
     def look_for_mounting(self, found: Estimate) -> Estimate:
         """With the rotation between robot and sensor from here on, if that explains what is left."""
@@ -385,6 +447,12 @@ def _check_fit(rms: float, touched: _Touched | None, limit: float, unit: str) ->
         )
 
 
+def _rarely(degrees: float) -> float:
+    """Chi squared by `degrees` that noise exceeds once in a thousand times (Wilson and Hilferty)."""
+    ninth = 2.0 / (9.0 * degrees)
+    return (1.0 - ninth + _RARE * math.sqrt(ninth)) ** 3
+
+
 def judge(poses: Sequence[Pose], residuals: Array, degrees: Array, name: str, weight: float) -> Fit:
     """How `residuals` (n, 3) of "force" or "torque" fit; `weight` in N, or Nm at its arm."""
     freedom, rms = max(float(degrees.sum()), 1.0), _residual(residuals, degrees)
@@ -393,9 +461,7 @@ def judge(poses: Sequence[Pose], residuals: Array, degrees: Array, name: str, we
     if spread.all():
         expected = spread**2 / np.array([[pose.samples] for pose in poses])
         chi_square = float((residuals**2 / expected).sum()) / freedom
-        # The quantile by Wilson and Hilferty.
-        ninth = 2.0 / (9.0 * freedom)
-        if chi_square <= (1.0 - ninth + _RARE * math.sqrt(ninth)) ** 3:
+        if chi_square <= _rarely(freedom):
             return Fit(rms, freedom, chi_square, "noise")
     return Fit(rms, freedom, chi_square, "small" if rms <= NEGLIGIBLE * weight else "large")
 

@@ -188,12 +188,16 @@ int main() {
             }
             told = json_list(loads, [](double value) { return json_text(value); });
         } else if (command == "bounds") {
-            std::array<double, 10> n{};
-            int tared = 0;
-            words >> tared;
+            std::array<double, 12> n{};
+            std::string model;
+            double lag_s = 0, rate_hz = 0;
+            int fir = 0, tared = 0;
+            words >> model >> lag_s >> fir >> rate_hz >> tared;
             for (double& each : n) words >> each;
-            const Bounds bounds(parameters.payload, tared != 0, {n[0], n[1], n[2]}, {n[3], n[4], n[5]}, {n[6], n[7], n[8]}, n[9]);
-            told = json_list(std::vector<double>{bounds.force, bounds.torque}, [](double value) { return json_text(value); });
+            const Tool tool(parameters.payload, model, Alignment(lag_s, 0.00096, fir != 0, rate_hz));
+            const Bounds bounds = tared == 2 ? tool.bounds(true, bota_ethercat::Vector3{n[9], n[10], n[11]}) : tool.bounds(tared != 0);
+            const auto found = bounds.at({n[0], n[1], n[2]}, {n[3], n[4], n[5]}, {n[6], n[7], n[8]});
+            told = json_list(std::vector<double>{found[0], found[1]}, [](double value) { return json_text(value); });
         } else if (command == "log") {
             const std::lock_guard<std::mutex> guard(lines_lock);
             told = json_list(lines, [](const std::string& each) { return json_text(each); });

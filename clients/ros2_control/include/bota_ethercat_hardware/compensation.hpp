@@ -32,43 +32,9 @@ struct Payload {
     // Half of the 95 % intervals; those of an inertia that is not identified are zeros.
     Vector3 center_interval{0.002, 0.002, 0.002}, offset_interval{0.784, 0.784, 0.784}, scale_interval{0.0098, 0.0098, 0.0098};
     std::array<double, 6> cross_axis_interval{0.0098, 0.0098, 0.0098, 0.0098, 0.0098, 0.0098}, inertia_interval{};
-};
-
-/// What the compensated wrench is wrong by without contact, in 95 % of samples: as bota_ft_compensation/bounds.py, which explains it.
-/// `tared`: the bias is of a tare by this accelerometer. `felt`, m/s^2, at the center of gravity; `rate`, rad/s; `spin`, rad/s^2.
-struct Bounds {
-    double force, torque;  ///< N, Nm
-
-    Bounds(const Payload& tool, bool tared, const Vector3& felt, const Vector3& rate, const Vector3& spin, double noise) noexcept {
-        constexpr double kAxes = 2.80 / 1.96, kPoses = 4.39 / 1.96, kReach = 0.1, kLikely = 0.2, kTyped = 0.1;
-        const auto& scale = tool.scale_interval;
-        const auto& crossed = tool.cross_axis_interval;
-        double largest = *std::max_element(crossed.begin(), crossed.end()), half = 0.0;
-        for (std::size_t i = 0; i < 3; ++i) {
-            const double part = std::max({scale[i], crossed[2 * i], crossed[2 * i + 1]});
-            half = std::max(half, std::hypot(tool.offset_interval[i], kStandardGravity * part));
-            largest = std::max(largest, scale[i]);
-        }
-        force = tool.mass * (tared ? kPoses * kStandardGravity * largest : kAxes * half);
-        auto halves = tool.inertia_interval;
-        if (halves == decltype(halves){}) {
-            const double moment = *std::max_element(tool.inertia.begin(), tool.inertia.end());
-            const double reach = tool.mass * (kReach * kReach + length(tool.center) * length(tool.center)), likely = kLikely * reach;
-            if (moment > 0.0) halves.fill(kTyped * moment);
-            else halves = {likely + reach, likely + reach, likely + reach, likely, likely, likely};
-        }
-        const double off_center = (tared ? kPoses : kAxes) * tool.mass * length(felt) *
-                                  *std::max_element(tool.center_interval.begin(), tool.center_interval.end());
-        const double arm = force * length(tool.center), sideways = 0.5 * length(rate) * spread(halves, rate), turned = spread(halves, spin);
-        torque = std::sqrt(turned * turned + sideways * sideways + off_center * off_center + arm * arm + noise * noise);
-    }
-
-private:
-    static double spread(const std::array<double, 6>& halves, const Vector3& v) noexcept {
-        const auto squared = [&halves](int i) { return halves[static_cast<std::size_t>(i)] * halves[static_cast<std::size_t>(i)]; };
-        return std::sqrt((squared(0) + squared(3) + squared(4)) * v[0] * v[0] + (squared(3) + squared(1) + squared(5)) * v[1] * v[1] +
-                         (squared(4) + squared(5) + squared(2)) * v[2] * v[2]);
-    }
+    std::array<double, 9> gyroscope{1, 0, 0, 0, 1, 0, 0, 0, 1};  ///< angular rates are this, row by row, times what is read
+    Vector3 imu_position{};  ///< m from the wrench origin; zeros: that of the model
+    std::array<double, 6> noise{}, left{};  ///< as Accuracy of bota_ft_compensation/quantities.py
 };
 
 /// How the offset that the sensor itself adds (object 0x8000) changes a bias: as bota_ft_compensation/stream.py.
@@ -123,17 +89,26 @@ struct Alignment {
         const bool whole = fir && lag_s;  // the IMU passes the FIR filter, too
         lead = 1 + static_cast<int>(late) + (whole ? 2 : 0);
         gap_s = std::max(whole ? 0.015 : 0.008, 2.5 / rate_hz);
-        const int count = static_cast<int>(std::ceil(late)) + (whole ? 13 : std::max(3, static_cast<int>(std::nearbyint(0.014 * rate_hz))));
+        const auto counted = [&](double history_s) {
+            return static_cast<int>(std::ceil(late)) + (whole ? 13 : std::max(3, static_cast<int>(std::nearbyint(history_s * rate_hz))));
+        };
+        const int count = counted(0.025);
         for (std::size_t band = 0; band < kBands; ++band) gains_[band] = lag_s ? gain(hertz(band) * period_s, whole) : 1.0;
         const double acceleration_noise = 250e-6 * kStandardGravity * std::sqrt(460.0), rate_noise = 0.01 * kPi / 180.0 * std::sqrt(184.0);
-        const auto turned = [&](bool slope) { return fitted(4.0, 1.5, rate_noise, std::max(at_s - gyroscope_s, -kFurthest), count, slope); };
+        const auto turned = [&](bool slope) { return fitted(6.0, 8.0, 8, rate_noise, std::max(at_s - gyroscope_s, -kFurthest), count, slope); };
         lead = std::min(lead + std::max(1, static_cast<int>(std::ceil(0.004 * rate_hz))), count);
-        taps = {lag_s ? fitted(10.0, 9.0, acceleration_noise, std::max(at_s, -kFurthest), count, false) : Taps{1.0}, turned(false), turned(true)};
+        taps = {lag_s ? fitted(10.0, 9.0, 3, acceleration_noise, std::max(at_s, -kFurthest), counted(0.014), false) : Taps{1.0}, turned(false), turned(true)};
+        felt_noise = acceleration_noise * norm(taps[0]), spin_noise = rate_noise * norm(taps[2]);
+        Taps passed{1.0};
+        if (fir) passed = fir_taps();
+        for (std::size_t i = 0; i < 2; ++i) noise_ratios[i] = norm(passed) * std::pow(51200.0 / rate_hz / 51.0, i == 0 ? -0.62 : -0.78);
     }
 
     double period_s, gap_s;  ///< samples further apart than `gap_s` do not belong together
     int lead;                      ///< this many samples are needed after a gap to tell the instant of force and torque
     std::array<Taps, 3> taps;      ///< to acceleration, angular rate and angular acceleration
+    double felt_noise, spin_noise;           ///< deviations that the IMU's noise makes on each axis, m/s^2 and rad/s^2
+    std::array<double, 2> noise_ratios{};    ///< of force and of torque, to those at SINC 51 with FIR off
 
 private:
     static constexpr std::size_t kBands = 21;
@@ -141,28 +116,41 @@ private:
 
     static double hertz(std::size_t band) { return 0.5 * std::pow(2.0, 0.5 * static_cast<double>(band)); }
 
-    /// Of the sinc filter, and of the FIR filter (22 taps, Kaiser, beta 8.8), at this share of the rate.
-    static double gain(double share, bool fir) {
-        const auto bessel = [](double x) {  // modified, of order 0
-            double sum = 0.0, term = 1.0;
-            for (int k = 1; k <= 30; ++k) sum += term, term *= x * x / (4.0 * k * k);
-            return sum;
-        };
-        double sum = 0.0, passed = 0.0;
-        for (int k = 0; fir && k < 22; ++k) {
-            const double x = (k - 10.5) / 10.5, tap = bessel(8.8 * std::sqrt(1.0 - x * x));
-            sum += tap, passed += tap * std::cos(2.0 * kPi * share * (k - 10.5));
+    static double norm(const Taps& taps) {
+        double squares = 0.0;
+        for (const double tap : taps) squares += tap * tap;
+        return std::sqrt(squares);
+    }
+
+    /// Of the FIR filter: 22 taps, Kaiser, beta 8.8.
+    static Taps fir_taps() {
+        Taps taps(22);
+        double all = 0.0;
+        for (std::size_t n = 0; n < taps.size(); ++n) {
+            const double x = (static_cast<double>(n) - 10.5) / 10.5, z = 8.8 * 8.8 * (1.0 - x * x);
+            double term = 1.0;  // the modified Bessel function of order 0
+            for (int k = 1; k <= 30; ++k) taps[n] += term, term *= z / (4.0 * k * k);
+            all += taps[n];
         }
-        return std::pow(std::abs(std::sin(kPi * share) / (kPi * share)), 3) * (fir ? std::abs(passed / sum) : 1.0);
+        for (double& tap : taps) tap /= all;
+        return taps;
+    }
+
+    /// Of the sinc filter, and of the FIR filter, at this share of the rate.
+    static double gain(double share, bool fir) {
+        double passed = fir ? 0.0 : 1.0, late = -10.5;
+        if (fir)
+            for (const double tap : fir_taps()) passed += tap * std::cos(2.0 * kPi * share * late++);
+        return std::pow(std::abs(std::sin(kPi * share) / (kPi * share)), 3) * std::abs(passed);
     }
 
     /// To the value `lag_s` before the newest sample, or the slope, of a motion with this density and noise.
-    Taps fitted(double rms, double from_hz, double noise, double lag_s, int count, bool slope) const {
+    Taps fitted(double rms, double from_hz, int steepness, double noise, double lag_s, int count, bool slope) const {
         const auto n = static_cast<std::size_t>(count);
         std::vector<Taps> rows(n + 2, Taps(n + 3));
         for (std::size_t band = 0; band < kBands; ++band) {
             const double hz = hertz(band), ratio = hz / from_hz, pace = 2.0 * kPi * hz;
-            const double expected = rms * rms * 0.5 * std::log(2.0) * ratio / std::pow(1.0 + ratio * ratio, 3), seen = expected * gains_[band];
+            const double expected = rms * rms * 0.5 * std::log(2.0) * ratio / std::pow(1.0 + ratio * ratio, steepness), seen = expected * gains_[band];
             for (std::size_t i = 0; i < n; ++i) {
                 const double age_s = static_cast<double>(i) * period_s, late = pace * (age_s - lag_s);
                 for (std::size_t j = 0; j < n; ++j) rows[i][j] += expected * std::cos(pace * (age_s - static_cast<double>(j) * period_s));
@@ -191,12 +179,91 @@ private:
     std::array<double, kBands> gains_{};
 };
 
+/// How wrong the compensated wrench may be without contact, in 95 % of samples: as bota_ft_compensation/bounds.py, which explains it.
+/// The IMU's filters are those that sensors are delivered with.
+class Bounds {
+public:
+    /// `lever`: from the IMU to the center of gravity. The bias is of a tare, in which this specific force was felt (none: not known).
+    Bounds(const Payload& tool, const Vector3& lever, const Alignment& alignment, bool tared, const std::optional<Vector3>& at = {})
+        : tared_(tared), from_(at) {
+        constexpr double kPlace = 1.3e-3, kSpin = 0.0075, kAligned = 0.006, kNormal = 1.96;
+        const auto& [xx, yy, zz, xy, xz, yz] = tool.inertia;
+        const std::array<Vector3, 3> tensor{{{xx, xy, xz}, {xy, yy, yz}, {xz, yz, zz}}};
+        const double mass = tool.mass, weight = square(mass / kNormal), at_arm = 2.0 / 3.0 * sum(tool.center), levers = sum(lever);
+        const double arm = mass * bota_ethercat::detail::dot(tool.center, lever), felt = 3.0 * square(mass * alignment.felt_noise);
+        Vector3 forces{}, torques{};  // squared, of an angular acceleration about each axis
+        for (std::size_t i = 0; i < 3; ++i) {
+            forces[i] = mass * mass * (levers - square(lever[i]));
+            for (std::size_t j = 0; j < 3; ++j) torques[i] += square((i == j ? arm : 0.0) - mass * lever[j] * tool.center[i] + tensor[i][j]);
+        }
+        const auto noise = [&](std::size_t i) { return square((tool.noise[i] > 0.0 ? tool.noise : kHealthy)[i] * alignment.noise_ratios[i / 3]); };
+        const double spin = square(alignment.spin_noise);
+        fixed_[0] = felt + (forces[0] + forces[1] + forces[2]) * spin + noise(0) + noise(1) + noise(2);
+        fixed_[1] = at_arm * felt + (torques[0] + torques[1] + torques[2]) * spin + noise(3) + noise(4) + noise(5);
+        double wrong = square(kAligned);
+        if (tool.left != decltype(tool.left){}) {
+            for (std::size_t part = 0; part < 2; ++part) {
+                const auto left = [&](std::size_t i) { return 3.0 * square(tool.left[3 * part + i]); };
+                if (!tared) fixed_[part] += left(0);
+                by_felt_[part].fill(tared ? left(1) : 0.0);
+                by_spin_[part].fill(left(2));
+            }
+        } else {
+            const auto& [c_xy, c_xz, c_yx, c_yz, c_zx, c_zy] = tool.cross_axis_interval;
+            const std::array<std::array<double, 2>, 3> columns{{{c_yx, c_zx}, {c_xy, c_zy}, {c_xz, c_yz}}};
+            const double offset = tared ? 0.0 : weight * sum(tool.offset_interval), off = 2.0 * square(mass * kPlace);
+            fixed_[0] += offset, fixed_[1] += at_arm * offset, wrong += square(kSpin);
+            const auto halves = inertia_halves(tool);
+            const std::array<Vector3, 3> elements{{{halves[0], halves[3], halves[4]}, {halves[3], halves[1], halves[5]}, {halves[4], halves[5], halves[2]}}};
+            for (std::size_t i = 0; i < 3; ++i) {
+                by_felt_[0][i] = weight * (square(tool.scale_interval[i]) + square(columns[i][0]) + square(columns[i][1]));
+                by_felt_[1][i] = weight * (sum(tool.center_interval) - square(tool.center_interval[i])) + at_arm * by_felt_[0][i];
+                by_spin_[0][i] = off, by_spin_[1][i] = sum(elements[i]) / square(kNormal) + at_arm * off;
+            }
+        }
+        for (std::size_t i = 0; i < 3; ++i) by_spin_[0][i] += wrong * forces[i], by_spin_[1][i] += wrong * torques[i];
+    }
+
+    /// N, Nm. `felt`, m/s^2, at the center of gravity; `rate`, rad/s; `spin`, rad/s^2.
+    std::array<double, 2> at(const Vector3& felt, const Vector3& rate, const Vector3& spin) const noexcept {
+        std::array<double, 2> found = fixed_;
+        const double quarter = 0.25 * sum(rate);
+        for (std::size_t i = 0; i < 3; ++i) {
+            const double less = tared_ && from_ ? (*from_)[i] : 0.0, turned = square(spin[i]) + quarter * square(rate[i]);
+            const double moved = tared_ && !from_ ? 2.0 / 3.0 * square(kStandardGravity) : square(felt[i] - less);
+            for (std::size_t part = 0; part < 2; ++part) found[part] += by_felt_[part][i] * moved + by_spin_[part][i] * turned;
+        }
+        return {std::sqrt(7.815 / 3.0 * found[0]), std::sqrt(2.8 * found[1])};
+    }
+
+private:
+    static constexpr std::array<double, 6> kHealthy{0.3, 0.3, 0.3, 0.007, 0.007, 0.0025};  // N, Nm, at SINC 51
+
+    static double square(double x) noexcept { return x * x; }
+    static double sum(const Vector3& v) noexcept { return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]; }
+
+    static std::array<double, 6> inertia_halves(const Payload& tool) {
+        auto halves = tool.inertia_interval;
+        if (halves != decltype(halves){}) return halves;
+        const double moment = *std::max_element(tool.inertia.begin(), tool.inertia.end()), reach = tool.mass * (0.01 + sum(tool.center));
+        halves.fill(0.1 * moment);
+        const double about = std::hypot(1.96 * 0.2, 0.6) * reach, across = 0.2 * reach;
+        return tool.inertia != decltype(tool.inertia){} ? halves : decltype(halves){about, about, about, across, across, across};
+    }
+
+    bool tared_;
+    std::optional<Vector3> from_;
+    std::array<double, 2> fixed_{};  // N^2, Nm^2
+    std::array<Vector3, 2> by_felt_{}, by_spin_{};
+};
+
 /// The load of the tool, of one sample after the other.
 class Tool {
 public:
     Tool(const Payload& payload, std::string_view model, Alignment alignment)
         : payload_(payload), alignment_(std::move(alignment)), lever_(payload.center) {
-        lever_[2] -= imu_height(model);
+        if (payload_.imu_position == Vector3{}) payload_.imu_position[2] = imu_height(model);
+        for (std::size_t i = 0; i < 3; ++i) lever_[i] -= payload_.imu_position[i];
         for (const auto& taps : alignment_.taps) count_ = std::max(count_, taps.size());
         ring_.resize(2 * count_);
     }
@@ -209,8 +276,8 @@ public:
         append(row(sample), time_s - time_s_);
         time_s_ = time_s;
         if (known_ < alignment_.lead && (moved_ || turns(ring_[at_])) && lever_ != Vector3{}) return none();
-        const Vector3 omega = aligned(1, 3), alpha = aligned(2, 3), tangential = vector_product(alpha, lever_);
-        const Vector3 centripetal = vector_product(omega, vector_product(omega, lever_)), s = aligned(0, 0);
+        const auto [s, omega, alpha] = aligned();
+        const Vector3 tangential = vector_product(alpha, lever_), centripetal = vector_product(omega, vector_product(omega, lever_));
         Vector3 force{};
         for (std::size_t i = 0; i < 3; ++i) force[i] = -payload_.mass * (s[i] + tangential[i] + centripetal[i]);
         Vector3 torque = vector_product(payload_.center, force);
@@ -218,6 +285,9 @@ public:
         for (std::size_t i = 0; i < 3; ++i) torque[i] -= spun[i] + turned[i];
         return {force[0], force[1], force[2], torque[0], torque[1], torque[2]};
     }
+
+    /// As there; of samples that come.
+    Bounds bounds(bool tared, const std::optional<Vector3>& at = {}) const { return {payload_, lever_, alignment_, tared, at}; }
 
 private:
     using Row = std::array<double, 6>;  // true acceleration, angular rate
@@ -247,7 +317,9 @@ private:
         for (std::size_t i = 0; i < 3; ++i) a[i] = (a[i] - payload_.accelerometer_offset[i]) / payload_.accelerometer_scale[i];
         const auto& [xy, xz, yx, yz, zx, zy] = payload_.accelerometer_cross_axis;
         const Vector3& w = sample.angular_rate;
-        return {a[0] - xy * a[1] - xz * a[2], a[1] - yx * a[0] - yz * a[2], a[2] - zx * a[0] - zy * a[1], w[0], w[1], w[2]};
+        const auto& g = payload_.gyroscope;
+        const auto turned = [&](std::size_t i) { return g[i] * w[0] + g[i + 1] * w[1] + g[i + 2] * w[2]; };
+        return {a[0] - xy * a[1] - xz * a[2], a[1] - yx * a[0] - yz * a[2], a[2] - zx * a[0] - zy * a[1], turned(0), turned(3), turned(6)};
     }
 
     /// Append a sample that comes `passed_s` after the one before, and interpolate those that are missing between them.
@@ -293,12 +365,16 @@ private:
         }
     }
 
-    /// Three of the columns from `first` on, with these weights.
-    Vector3 aligned(std::size_t taps, std::size_t first) const noexcept {
-        Vector3 sum{};
-        for (std::size_t k = 0; k < alignment_.taps[taps].size(); ++k)
-            for (std::size_t i = 0; i < 3; ++i) sum[i] += alignment_.taps[taps][k] * ring_[at_ + k][first + i];
-        return sum;
+    /// Acceleration, angular rate and angular acceleration at the instant of force and torque.
+    std::array<Vector3, 3> aligned() const noexcept {
+        Vector3 s{}, omega{}, alpha{};
+        const auto& [value, rate, slope] = alignment_.taps;
+        const Row* row = &ring_[at_];
+        for (std::size_t k = 0; k < value.size(); ++k)
+            for (std::size_t i = 0; i < 3; ++i) s[i] += value[k] * row[k][i];
+        for (std::size_t k = 0; k < rate.size(); ++k)
+            for (std::size_t i = 0; i < 3; ++i) omega[i] += rate[k] * row[k][3 + i], alpha[i] += slope[k] * row[k][3 + i];
+        return {s, omega, alpha};
     }
 
     Payload payload_;

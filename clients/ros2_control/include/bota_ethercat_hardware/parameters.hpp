@@ -131,10 +131,14 @@ inline constexpr Row kRows[] = {
     {"accelerometer.offset_interval", "three numbers (m/s^2)", [](S t, P& p) { return numbers(t, p.payload.offset_interval, 0.0); }},
     {"accelerometer.scale_interval", "three numbers", [](S t, P& p) { return numbers(t, p.payload.scale_interval, 0.0); }},
     {"accelerometer.cross_axis_interval", "six numbers", [](S t, P& p) { return numbers(t, p.payload.cross_axis_interval, 0.0); }},
+    {"gyroscope_matrix", "nine numbers", [](S t, P& p) { return numbers(t, p.payload.gyroscope); }},
+    {"imu_position", "three numbers (m)", [](S t, P& p) { return numbers(t, p.payload.imu_position); }},
+    {"accuracy.noise", "six numbers (N, Nm)", [](S t, P& p) { return numbers(t, p.payload.noise, 0.0); }},
+    {"accuracy.left", "six numbers", [](S t, P& p) { return numbers(t, p.payload.left, 0.0); }},
     {"bias", "six numbers (N, Nm)", [](S t, P& p) { return numbers(t, p.bias); }},
     {"sensor_offset", "six numbers (N, Nm)", [](S t, P& p) { return numbers(t, p.sensor_offset.emplace()); }},
 };
-inline constexpr std::size_t kOfTool = 13;  // the last rows
+inline constexpr std::size_t kOfTool = 17;  // the last rows
 
 /// Parameters of the ROS 2 node in a YAML file, a line each; false if they are wrong, or tool_mass is not among them.
 inline bool read_payload(const std::string& path, Parameters& into) {

@@ -267,6 +267,9 @@ public:
     /// The sensor of `open`.
     const SensorInfo& sensor() const { return *sensor_; }
     /// s up to which a sample is fresh now: another rate may make it another.
+    /// Of the compensated wrench, if there is a tool and the sensor is known.
+    Bounds bounds() const { return tool_->bounds(parameters_.on_activate_tare); }
+
     double max_age() noexcept { return seconds(latest_.newest().max_age_ns); }
     /// The newest reading, which the next `read` shows, or a newer one.
     const bota_ethercat::Reading& reading() noexcept { return latest_.newest().reading; }
