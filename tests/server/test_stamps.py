@@ -11,6 +11,8 @@ import random
 import struct
 from collections.abc import Callable, Sequence
 from statistics import median
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -303,3 +305,14 @@ def test_stamps_follow_a_slewed_clock_also_where_reading_it_is_held_up() -> None
         clock.sleep(0.001)
         now_ns = clock.now_ns
         assert abs(clocks.monotonic_ns(now_ns) - clock.slewed_ns(now_ns)) < 10_000
+
+
+def test_an_instant_is_converted_by_the_clocks_of_now() -> None:
+    """Of a sensor that gives nothing new, which has no other reason to follow them."""
+    clock: Any = SimpleNamespace(now_ns=10**9)
+    clock.raw_ns = lambda: clock.now_ns
+    clock.time_ns = clock.monotonic_ns = lambda: round(1.05 * clock.now_ns)
+    clocks = StampClocks(clock)
+    for _ in range(3):
+        clock.now_ns += 10**9
+        assert clocks.monotonic_ns(clock.now_ns) == pytest.approx(clock.monotonic_ns(), abs=2)
