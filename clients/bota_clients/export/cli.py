@@ -31,8 +31,9 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     add = made.add_argument
     _add_recording(made)
-    add("output", type=Path, nargs="?", metavar="OUT",
-        help="file to write (default: RECORDING.csv, with --at or --fps RECORDING.parquet)")  # fmt: skip
+    add("output", nargs="*", metavar="OUT",
+        help="file to write (default: RECORDING.csv, with --at or --fps RECORDING.parquet); a folder, after "
+        "one recording or several: data set of all, Parquet by serial and day")  # fmt: skip
     add("--all", action="store_true", help="CSV: also frames that are no new sample: repeated, invalid")
     add("--tool", type=Path, metavar="YAML",
         help="not CSV: also the compensated wrench, with these parameters of the ROS 2 node")  # fmt: skip
@@ -56,6 +57,16 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         help="refuse frames outside of the recording (default: their windows are not valid)")  # fmt: skip
     options = made.parse_intermixed_args(argv)
     has_frames = options.at is not None or options.fps is not None
+    outputs: list[str] = options.output
+    is_folder = len(outputs) > 1 or any(each.endswith("/") or Path(each).is_dir() for each in outputs)
+    options.recordings = [options.recording, *map(Path, outputs[:-1])] if is_folder else []
+    options.output = Path(outputs[-1]) if outputs else None
+    if is_folder:
+        if options.mcap or options.all or has_frames:
+            made.error("a data set has all samples: omit --mcap, --all, --at, --fps")
+        if options.output.suffix or options.output.is_file():
+            made.error(f"{options.output}: with several recordings the last name is that of a folder")
+        return options
     if options.output and options.output.suffix.lower() == ".mcap" and not options.mcap:
         options.mcap, options.output = options.output, None
     if options.mcap and (options.output or options.all or options.tool or has_frames):
@@ -136,4 +147,5 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if argv is None else argv
     if given[:1] == ["align"]:
         return start(PROGRAM, "export.align", parse_align(given[1:]))
-    return start(PROGRAM, "export.cli", parse_options(given))
+    options = parse_options(given)
+    return start(PROGRAM, "export.collection" if options.recordings else "export.cli", options)

@@ -34,9 +34,9 @@ from bota_clients.export.samples import MOST_LOST, samples_of
 from bota_clients.export.windows import Array, Arrays, Windows, interpolated, read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
-from bota_clients.recording.columns import Ints
+from bota_clients.recording.columns import REGISTERS, Ints
 from bota_clients.recording.order import TimeAxis, in_order, longest_order
-from bota_clients.recording.reader import Recording, Since
+from bota_clients.recording.reader import RecordedSensor, Recording, Since
 from bota_ethercat.errors import BadMessageError, FileError
 from bota_ethercat.program.command import command
 from bota_ethercat.program.new_file import EXISTS
@@ -48,7 +48,7 @@ from bota_ft_compensation.identification.resampling import stretches
 from bota_ft_compensation.stream import obstacle
 
 _ALIGN: Final = command("ethercat-export align")
-_ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
+ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
 _CHUNK: Final = 1024  # frames, in a file
 _GROUP: Final = 131_072  # samples, in a file
 _UNITS: Final = {"force": "N", "torque": "Nm", "acceleration": "m/s^2", "angular_rate": "rad/s", "age": "s"}
@@ -443,7 +443,47 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
         whys = {obstacle(row.info.settings, has_tool=has_tool, by_imu=True) for row in sensor.history}
         if whys and "" not in whys:
             raise RecordingError(f"the wrench cannot be compensated: {min(whys)}; or omit --tool")
-    about = {
+    said = json.dumps(about(options, recording, sensor, tool=tool, clock=clock), default=str)
+    if path.exists() and not (options.force and (path.is_file() or (path / "zarr.json").exists())):
+        raise FileError(f"{path} {EXISTS}")
+    with tempfile.TemporaryDirectory(
+        prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
+    ) as folder:
+        made, valid = Path(folder, path.name), list[Array]()
+        if frames:
+            blocks = in_chunks(windows_of(recording, frames, windows, sensor.sensor, axis), _CHUNK)
+        else:
+            blocks = in_chunks(samples_of(recording, windows, sensor.sensor, axis), _GROUP)
+            blocks = _tallied(blocks, valid)
+        _WRITERS[options.suffix](made, said, blocks)
+        if path.is_dir():
+            shutil.rmtree(path)
+        made.replace(path)
+    remarks = axis.said
+    if not frames:
+        rows = np.concatenate(valid)
+        remarks.insert(0, f"{count(len(rows), 'sample')}, {len(rows) - rows.sum()} of them not valid")
+        return "; ".join(remarks)
+    if isinstance(frames, Stamped) and frames.outside:
+        remarks.append(
+            f"those of {frames.outside} of {count(frames.count, 'frame')} are not valid: the frames are "
+            "before or after the recording (--strict refuses them)"
+        )
+    if isinstance(frames, Stamped) and frames.left_out:
+        remarks.append(f"{count(frames.left_out, 'frame')} left out, not later than the row before")
+    return "; ".join([f"windows of {count(length, 'sample')}", *remarks])
+
+
+def about(
+    options: argparse.Namespace,
+    recording: Recording,
+    sensor: RecordedSensor,
+    *,
+    tool: Mapping[str, Any] | None,
+    clock: ForeignClock | None = None,
+) -> dict[str, Any]:
+    """The attributes of a file."""
+    return {
         "program": f"{PROGRAM} {VERSION}",
         "options": vars(options) | {"imu_units": options.imu_units.value},
         "recording": recording.metadata,
@@ -461,34 +501,6 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
         "clock": clock and clock._asdict(),
         "tool": tool,
     }  # fmt: skip
-    if path.exists() and not (options.force and (path.is_file() or (path / "zarr.json").exists())):
-        raise FileError(f"{path} {EXISTS}")
-    with tempfile.TemporaryDirectory(
-        prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
-    ) as folder:
-        made, valid = Path(folder, path.name), list[Array]()
-        if frames:
-            blocks = _in_chunks(windows_of(recording, frames, windows, sensor.sensor, axis), _CHUNK)
-        else:
-            blocks = _in_chunks(samples_of(recording, windows, sensor.sensor, axis), _GROUP)
-            blocks = _tallied(blocks, valid)
-        _WRITERS[options.suffix](made, json.dumps(about, default=str), blocks)
-        if path.is_dir():
-            shutil.rmtree(path)
-        made.replace(path)
-    said = axis.said
-    if not frames:
-        rows = np.concatenate(valid)
-        said.insert(0, f"{count(len(rows), 'sample')}, {len(rows) - rows.sum()} of them not valid")
-        return "; ".join(said)
-    if isinstance(frames, Stamped) and frames.outside:
-        said.append(
-            f"those of {frames.outside} of {count(frames.count, 'frame')} are not valid: the frames are "
-            "before or after the recording (--strict refuses them)"
-        )
-    if isinstance(frames, Stamped) and frames.left_out:
-        said.append(f"{count(frames.left_out, 'frame')} left out, not later than the row before")
-    return "; ".join([f"windows of {count(length, 'sample')}", *said])
 
 
 def _tallied(blocks: Iterable[Arrays], valid: list[Array]) -> Iterator[Arrays]:
@@ -514,45 +526,68 @@ def _check_offsets(
         )
 
 
-def _in_chunks(blocks: Iterable[Arrays], size: int) -> Iterator[Arrays]:
+def in_chunks(blocks: Iterable[Arrays], size: int) -> Iterator[Arrays]:
     """The same in larger blocks: for each small one Zarr rewrites a chunk, and Parquet has a row group."""
-    held = Arrays()
+    held, count = list[Arrays](), 0
     for block in blocks:
-        held = {name: np.concatenate([held[name], block[name]]) for name in block} if held else block
-        while len(held["monotonic_ns"]) >= size:
-            yield {name: array[:size] for name, array in held.items()}
-            held = {name: array[size:] for name, array in held.items()}
-    if len(held.get("monotonic_ns", ())):
-        yield held
+        held.append(block)
+        count += len(block["monotonic_ns"])
+        if count >= size:
+            whole, count = _as_one(held), count % size
+            end = len(whole["monotonic_ns"]) - count
+            for begin in range(0, end, size):
+                yield {name: array[begin : begin + size] for name, array in whole.items()}
+            held = [{name: array[end:].copy() for name, array in whole.items()}]
+    if count:
+        yield _as_one(held)
+
+
+def _as_one(blocks: Sequence[Arrays]) -> Arrays:
+    return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
 
 
 def _parquet(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
     """One row for each frame or sample; a window is a fixed-size list, sample by sample."""
-    import pyarrow as pa  # noqa: PLC0415 - of the extra `dataset`
-    from pyarrow import parquet  # noqa: PLC0415
 
     writer: Any = None
     for block in blocks:
-        columns: dict[str, Any] = {}
-        for name, array in block.items():
-            flat, size = pa.array(array.reshape(-1)), array[0].size
-            if name == "sequence":
-                flat = pa.array(array, mask=array < 0)
-            elif array.dtype.kind == "M":
-                flat = flat.cast(pa.timestamp("ns", "UTC"))
-            columns[name] = flat if array.ndim == 1 else pa.FixedSizeListArray.from_arrays(flat, size)
-        table = pa.table(columns, metadata={_ATTRIBUTES: about})
-        if writer is None:  # of numbers, for every reader
-            compression = "snappy" if "valid" in columns else "zstd"
-            writer = parquet.ParquetWriter(path, table.schema, compression=compression)
+        table = arrow_of(block, about)
+        writer = writer or parquet_writer(path, table.schema)
         writer.write_table(table)
     writer.close()
 
 
+def arrow_of(block: Arrays, about: str) -> Any:
+    """A `pyarrow.Table` of the same rows, with the attributes."""
+    import pyarrow as pa  # noqa: PLC0415 - of the extra `dataset`
+
+    columns: dict[str, Any] = {}
+    for name, array in block.items():
+        flat, size = pa.array(array.reshape(-1)), array[0].size
+        if name == "sequence":
+            flat = pa.array(array, mask=array < 0)
+        elif array.dtype.kind == "M":
+            flat = flat.cast(pa.timestamp("ns", "UTC"))
+        columns[name] = flat if array.ndim == 1 else pa.FixedSizeListArray.from_arrays(flat, size)
+    return pa.table(columns, metadata={ATTRIBUTES: about})
+
+
+def parquet_writer(path: Path, schema: Any, more: Mapping[str, str] = {}) -> Any:
+    """For tables of this schema, with more metadata."""
+    from pyarrow import parquet  # noqa: PLC0415 - of the extra `dataset`
+
+    is_samples = "valid" in schema.names
+    # A dictionary of measured numbers costs most of the time and saves nothing.
+    few = [name for name in (*REGISTERS, "recording") if name in schema.names]
+    return parquet.ParquetWriter(
+        path, schema.with_metadata({**schema.metadata, **more}),
+        compression="snappy" if is_samples else "zstd", use_dictionary=few if is_samples else True,
+    )  # fmt: skip
+
+
 def _npz(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
     """An array for each name, and `attributes`, text."""
-    made = list(blocks)
-    arrays: dict[str, Any] = {name: np.concatenate([block[name] for block in made]) for name in made[0]}
+    arrays: dict[str, Any] = _as_one(list(blocks))
     np.savez(path, attributes=np.array(about), **arrays)
 
 
@@ -560,7 +595,7 @@ def _zarr(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
     """A group with an array for each name."""
     import zarr  # noqa: PLC0415 - of the extra `dataset`
 
-    group: Any = zarr.open_group(str(path), mode="w", attributes={_ATTRIBUTES: json.loads(about)})
+    group: Any = zarr.open_group(str(path), mode="w", attributes={ATTRIBUTES: json.loads(about)})
     for block in blocks:
         for name, array in block.items():
             if name not in group:

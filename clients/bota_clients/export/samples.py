@@ -40,7 +40,8 @@ def samples_of(
         if in_force is not None and batch is not None:
             windows.configure(in_force)
             is_new, flags = new.among(batch.flags, sensor)
-            samples = windows.add(replace(batch, flags=flags).where(is_new))
+            marked = replace(batch, flags=flags)
+            samples = windows.add(marked if is_new.all() else marked.where(is_new))
             held = [joined([*held, samples])]
         slots = windows.take(rest=in_force is None)
         if not len(slots):
@@ -49,7 +50,7 @@ def samples_of(
         yield _rows(slots, held[0], slots["number"] - begin, first_ns, tool=windows.stream is not None)
         taken = int(slots["number"].max(initial=taken - 1)) + 1
         keep = max(taken - 1, 0)  # lost samples that follow are between this one and the next
-        held, begin = [held[0].where(np.arange(begin, begin + len(held[0])) >= keep)], keep
+        held, begin = [held[0].where(slice(keep - begin, None))], keep
     if not taken:
         raise RecordingError(f"{recording.path} has no new and valid samples")
 
@@ -57,11 +58,12 @@ def samples_of(
 def _rows(slots: Array, samples: Columns, index: Array, first_ns: int, *, tool: bool) -> Arrays:
     """Of each slot, by the index of its sample; negative: it was lost."""
     is_lost = slots["number"] < 0
-    index = np.where(is_lost, 0, index)
+    index, any_lost = np.where(is_lost, 0, index), bool(is_lost.any())
 
     def column(name: str, lost: Any = np.nan) -> Array:
         values = getattr(samples, name)[index]
-        values[is_lost] = lost
+        if any_lost:
+            values[is_lost] = lost
         return np.asarray(values)
 
     monotonic_ns = slots["monotonic_ns"]
@@ -78,7 +80,8 @@ def _rows(slots: Array, samples: Columns, index: Array, first_ns: int, *, tool: 
     axes = {
         f"{name}_{axis}_{unit}": (name, place) for name, unit in VECTORS for place, axis in enumerate("xyz")
     }
-    found |= {name: column(of)[:, place].astype(np.float32) for name, (of, place) in axes.items()}
+    vectors = {name: column(name).astype(np.float32) for name, _ in VECTORS}
+    found |= {name: vectors[of][:, place] for name, (of, place) in axes.items()}
     if tool:
         wrench = np.where(found["valid"][:, np.newaxis], slots["compensated"], np.nan)
         found["compensated_valid"] = np.asarray(np.isfinite(wrench).all(axis=1))

@@ -156,17 +156,18 @@ class Windows:
         slots["measured_ns"] = slots["monotonic_ns"][:, np.newaxis] - self._delay_ns
         # A frame that was not read in time has a number, a sample that the server never had does not.
         slots["sequence"] = np.where((further == lost + 1)[of], (sequence - further)[of] + after, -1)
-        slots["sequence"][end], slots["number"] = sequence, -1
-        slots["number"][end] = np.arange(self._taken, self._taken + len(end))
+        at: Any = end if kept.any() else slice(None)
+        slots["sequence"][at], slots["number"] = sequence, -1
+        slots["number"][at] = np.arange(self._taken, self._taken + len(end))
         self._taken += len(end)
         values = np.hstack([samples.force, samples.torque, samples.acceleration, samples.angular_rate])
         slots["values"] = math.nan
-        slots["values"][end] = np.where(np.isfinite(values), values, math.nan)
+        slots["values"][at] = np.where(np.isfinite(values), values, math.nan)
         is_off = self._known.get("imu_active") == 0
         for place, (channel, part) in enumerate(_CHANNELS.items()):
             is_good = (channel.flagged(samples) == 0) & np.isfinite(values[:, part]).all(axis=1)
-            slots["valid"][end, place] = is_good & (channel is FORCE_TORQUE or not is_off)
-        slots["compensated"][end], slots["bounds"][end] = (
+            slots["valid"][at, place] = is_good & (channel is FORCE_TORQUE or not is_off)
+        slots["compensated"][at], slots["bounds"][at] = (
             (math.nan, math.nan) if self.stream is None else self.stream.compensate(samples)
         )
         self._slots = np.concatenate([self._slots, slots])

@@ -31,6 +31,7 @@ from mcap.records import Channel, Chunk, Metadata
 
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
+from bota_clients.progress import progress
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 # Largest chunk in bytes, compressed or not. Those of ethercat-record have some hundred kilobytes.
@@ -153,11 +154,13 @@ class McapFile:
 
         Shorter ones are padded with zeros. RecordingError as `messages`.
         """
-        for chunk in self._chunks:
-            if not chunk.counts.keys().isdisjoint(channels):
-                for opcode, rows in self._records_in(chunk):
-                    if opcode == Opcode.MESSAGE:
-                        yield rows
+        with progress(self.path.name, len(self._chunks)) as reach:
+            for number, chunk in enumerate(self._chunks):
+                if not chunk.counts.keys().isdisjoint(channels):
+                    for opcode, rows in self._records_in(chunk):
+                        if opcode == Opcode.MESSAGE:
+                            yield rows
+                reach(number + 1)
 
     def _open(self) -> None:
         if self._file.read(len(MAGIC)) != MAGIC:

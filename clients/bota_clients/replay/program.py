@@ -13,6 +13,7 @@ from typing import Any, Final, NoReturn
 
 from bota_clients.errors import RecordingError
 from bota_clients.program import Signals, say
+from bota_clients.progress import switch_off
 from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
 from bota_clients.recording.reader import Recording, open_recording
 from bota_clients.replay.pacing import Pacing
@@ -35,6 +36,7 @@ _say = partial(say, "ethercat-replay")
 
 
 def run(options: argparse.Namespace, signals: Signals) -> int:
+    switch_off()
     logging.basicConfig(level=logging.INFO, format="ethercat-replay: %(message)s", stream=sys.stderr)
     try:
         with open_recording(options.path) as recording:
