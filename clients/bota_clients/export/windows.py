@@ -84,7 +84,8 @@ class Windows:
         self.stream: CompensatedStream | None = None
         self._slots = np.zeros(0, _SLOT)
         self._newest = (0, 0)  # stamp and sequence of the newest sample
-        self._taken = 0  # samples
+        self._taken = self._epoch = 0  # samples; of what is in force
+        self._begins = False  # another stream, which the first sample after a pause need not say
         self._made_of: tuple[Mapping[str, object], float] | None = None
         self._doubt_ns = 0
         if tool is not None:
@@ -97,6 +98,7 @@ class Windows:
         is known there is no compensated wrench.
         """
         settings, rate_hz = in_force.info.settings, in_force.info.rate_hz
+        self._begins, self._epoch = self._begins or in_force.epoch != self._epoch, in_force.epoch
         if self.stream is not None:
             self._follow(in_force, self.stream)
         if (settings, rate_hz) == self._made_of:
@@ -142,6 +144,7 @@ class Windows:
             raise RecordingError("the server's machine was restarted meanwhile: record again")
         further = np.diff(sequence, prepend=self._newest[1])
         is_gap = (samples.flags & int(DataFlag.GAP) != 0) | (further != 1)
+        is_gap[0], self._begins = is_gap[0] or self._begins, False
         self._newest = int(stamps[-1]), int(sequence[-1])
         lost = np.maximum(np.rint(passed * (self._rate_hz * 1e-9)).astype(np.int64) - 1, 0) * is_gap
         # Of the slots of lost samples the first ones do: a window is not longer.
@@ -173,19 +176,24 @@ class Windows:
         self._slots = np.concatenate([self._slots, slots])
         return samples
 
-    def at(self, instants_ns: Ints) -> Arrays:
+    def at(self, instants_ns: Ints, *, is_partial: bool = False) -> Arrays:
         """Windows of these f instants; the last sample of each is the newest.
 
         `force_torque`, `force_torque_compensated` (f, length, 6) N, Nm; `imu` (f, length, 6) m/s², rad/s;
         of each channel `..._age` (f, length) s before the instant and `..._valid` (f, length). ValueError for
-        an instant after `until_ns`.
+        an instant after `until_ns`, of which not all samples are here: if `is_partial`, these are not valid.
         """
-        if (instants_ns > self.until_ns).any():
+        if not is_partial and (instants_ns > self.until_ns).any():
             raise ValueError(f"after {self.until_ns} ns not all samples are here: take more")
-        slots, found = self._slots, Arrays()
+        slots, found = self._slots if len(self._slots) else np.zeros(1, _SLOT), Arrays()
         for channel, ((name, *_), part) in enumerate(_CHANNELS.items()):
-            index = self._ends(instants_ns, channel)[:, np.newaxis] + np.arange(-self._length, 0)
-            is_there, index = index >= 0, np.maximum(index, 0)
+            ends = self._ends(instants_ns, channel)
+            if is_partial and len(self._slots):
+                late_ns = np.maximum(instants_ns - self._slots["measured_ns"][-1, channel], 0)
+                ends = ends + np.int64(late_ns * (self._rate_hz * 1e-9))
+            index = ends[:, np.newaxis] + np.arange(-self._length, 0)
+            is_there = (index >= 0) & (index < len(self._slots))
+            index = np.clip(index, 0, len(slots) - 1)
             valid = slots["valid"][index, channel] & is_there
             age_s = (instants_ns[:, np.newaxis] - slots["measured_ns"][index, channel]) * 1e-9
             values, wrench = slots["values"][index, part], slots["compensated"][index]

@@ -54,11 +54,11 @@ class TimeAxis:
     Attributes:
         restarts: how many there were so far.
         left_out: new samples so far that were not later than the one before.
+        shift_ns: place of the latest frame less its CLOCK_MONOTONIC.
     """
 
     def __init__(self) -> None:
-        self.restarts = self.left_out = 0
-        self._shift_ns = self._stamp_ns = 0
+        self.restarts = self.left_out = self.shift_ns = self._stamp_ns = 0
         self._last_ns = self._before_ns = -1  # of the latest frame, and of the one before
         self._newest_ns = -1
         self._undo: tuple[int, int] | None = None  # what was before a restart, which may be a stray stamp
@@ -71,18 +71,18 @@ class TimeAxis:
         events = {row + more for row in fell for more in (0, 1)} | ({0} if self._undo else set())
         shifts, since = np.zeros(len(monotonic_ns), np.int64), 0
         for row in sorted(events & {*range(len(monotonic_ns))} if events else ()):
-            shifts[since:row], since = self._shift_ns, row
+            shifts[since:row], since = self.shift_ns, row
             now_ns, last_ns = int(now[row + 2]), int(now[row + 1])
             undo, self._undo = self._undo, None
             if undo and now_ns > undo[0]:  # else the latest one was the stray
                 self.restarts -= 1
-                self._shift_ns = undo[1]
+                self.shift_ns = undo[1]
             elif int(now[row]) >= now_ns < last_ns - _SECOND:
                 self.restarts += 1
-                self._undo = last_ns, self._shift_ns
+                self._undo = last_ns, self.shift_ns
                 passed_ns = max(_SECOND, int(stamps[row + 1] - stamps[row]))
-                self._shift_ns = min(self._shift_ns + last_ns - now_ns + passed_ns, _MAX)
-        shifts[since:] = self._shift_ns
+                self.shift_ns = min(self.shift_ns + last_ns - now_ns + passed_ns, _MAX)
+        shifts[since:] = self.shift_ns
         if len(monotonic_ns):
             self._before_ns, self._last_ns = now[-2:].tolist()
             self._stamp_ns = int(stamps[-1])
