@@ -5,10 +5,12 @@ from __future__ import annotations
 import importlib
 import json
 import math
+import os
 import random
 import re
 import shutil
 import struct
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -336,7 +338,13 @@ def test_the_code_of_the_pages_runs(code: str, tmp_path: Path, monkeypatch: pyte
         run_here(main, "run.mcap", f"run.{suffix}", "--fps", 30)
     for made in ("samples.parquet", "whole.mcap"):
         run_here(main, "run.mcap", made)
+    run_here(main, "run.mcap", "data/")
     shutil.make_archive("run", "zip", "run.zarr")
+    Path("runs").mkdir()
+    shutil.copy("run.mcap", "runs")
+    if "import ray" in code:  # a cluster of two workers
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+        importlib.import_module("ray").init(num_cpus=2, include_dashboard=False)
     if "lerobot" in code:
         lerobot, state = (
             importlib.import_module("lerobot.datasets.lerobot_dataset"),

@@ -8,10 +8,12 @@ import re
 import struct
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import zstandard
+from mcap.reader import NonSeekingReader
+from mcap.writer import CompressionType, IndexType, Writer
 
 from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
@@ -129,6 +131,53 @@ def test_columns_are_what_the_decoder_gives(path: Path) -> None:
     with open_recording(path) as recording:
         table = recording.columns(0)
     assert (len(table), table.force.shape, table.orientation.shape) == (0, (0, 3), (0, 4))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_any_valid_file_is_read_as_the_mcap_library_reads_it(tmp_path: Path, seed: int) -> None:
+    """Chunks of all sizes, two sensors of different process data, other messages between, other writers."""
+    draw, path = random.Random(seed), tmp_path / "any.mcap"
+    with path.open("wb") as file:
+        kind = draw.choice((CompressionType.ZSTD, CompressionType.NONE))
+        size, has_crc, has_index = draw.choice((1, 300, 9000, 1 << 20)), draw.random() < 0.5, seed % 3 > 0
+        index = IndexType.ALL if has_index else IndexType.NONE
+        made = Writer(file, size, kind, index_types=index, enable_data_crcs=has_crc)
+        made.start("ros2", "any")
+        made.add_metadata(file_format.METADATA, {"format": "1"})
+        schemas = {
+            name: made.register_schema(name, "ros2msg", text.encode())
+            for name, text in file_format.DEFINITIONS.items()
+        }
+        topics = [file_format.frame_topic(sensor) for sensor in (0, 1)] + [file_format.EVENTS_TOPIC, "/other"]
+        channels = [
+            made.register_channel(topic, "cdr", schemas[list(schemas)[topic.startswith("/ethercat/sensor")]])
+            for topic in topics
+        ]
+        for number in range(draw.choice((40, 900))):
+            sensor = draw.choice((0, 1)) if seed % 2 else number // 50 % 2
+            item = frame(number, sensor, draw.choice((0, 0, 0, 1, 2, 4)), draw.choice((61, 61, 77)))
+            made.add_message(channels[sensor], item.stamp_ns, file_format.pack_frame(item), item.stamp_ns)
+            if draw.random() < 0.05:
+                event = file_format.pack_json({"event": "x" * draw.randrange(90), "number": number})
+                made.add_message(channels[2], item.stamp_ns, event, item.stamp_ns)
+            if draw.random() < 0.1:
+                made.add_message(channels[3], item.stamp_ns, bytes(draw.randrange(200)), item.stamp_ns)
+        made.finish()  # type: ignore[no-untyped-call]
+    with path.open("rb") as file, open_recording(path) as recording:
+        told = [
+            (topic.topic, message.data)
+            for _, topic, message in NonSeekingReader(file).iter_messages(log_time_order=False)
+        ]
+        for sensor in (0, 1):
+            own = [file_format.unpack_frame(data, sensor) for topic, data in told if topic == topics[sensor]]
+            assert str(recording.columns(sensor)) == str(columns(own))
+            assert list(recording.frames(sensor)) == own
+        tables = [each for each in recording.tables() if not isinstance(each, RecordedEvent)]
+        numbers = [int(row) for each in tables for row in cast(Any, each)["sequence"]]
+        assert numbers == [each.sequence for each in recording.frames()]
+        assert [each.event for each in recording.events] == [
+            file_format.unpack_json(data, topic) for topic, data in told if topic == topics[2]
+        ]
 
 
 # -- cut off

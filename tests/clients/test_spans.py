@@ -6,7 +6,7 @@ import functools
 import itertools
 import random
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,12 +16,15 @@ import pytest
 from bota_clients.export.cli import main as export
 from bota_clients.identify.cli import main as identify
 from bota_clients.recording.order import longest_order
+from bota_clients.report.checks import Examination
 from bota_clients.report.cli import main as report
+from bota_clients.report.series import of_recording
 from bota_ethercat.framing import DataMessage
+from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.settings import start_up_defaults
 from bota_ft_compensation.quantities import Payload
 from tests.clients.bags import imu, write_bag
-from tests.clients.recordings import describe, write
+from tests.clients.recordings import START_NS, describe, write
 from tests.clients.test_identify import felt_frames
 from tests.compensation import motion
 from tests.ended import Result, run_here
@@ -195,3 +198,31 @@ def test_the_most_are_kept() -> None:
         kept = longest_order(rows)
         assert kept.sum() == most, rows
         assert longest_order(row for row, is_kept in zip(rows, kept, strict=True) if is_kept).all()
+
+
+def again(count: int) -> Iterator[DataMessage]:
+    """So many frames of the same motion."""
+    first = moving()[0]
+    for number in range(count):
+        frame, moment_ns = first[number % len(first)], number * SECOND // RATE_HZ
+        yield frame._replace(sequence=number, stamp_ns=START_NS + moment_ns, monotonic_ns=moment_ns)
+
+
+def examine(path: Path) -> None:
+    """What a report does before it draws."""
+    for subject in of_recording(path, ImuUnits.G_DPS):
+        Examination(subject)
+
+
+@pytest.mark.parametrize("program", [examine, lambda path: run_here(identify, path, "--json")])
+def test_memory_does_not_grow_with_the_length(tmp_path: Path, program: Callable[[Path], object]) -> None:
+    peaks, path = [], tmp_path / "run.mcap"
+    for seconds in (200, 800):
+        row = describe(0, **SETTINGS)
+        row["sensors"][0]["rate_hz"] = RATE_HZ
+        write(path, itertools.chain([row], again(RATE_HZ * seconds)))
+        tracemalloc.start()
+        program(path)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0]

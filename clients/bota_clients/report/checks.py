@@ -195,7 +195,8 @@ def _window(time: Floats, values: Floats, usable: Bools) -> Floats:
     basis = np.polynomial.legendre.legvander((time - middle) / half, _ORDER)
     good = usable.all(axis=0)
     values = np.where(good, values, 0.0)
-    trend = basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
+    basis = np.linalg.qr(basis)[0]
+    trend = basis @ (basis.T @ values)
     deviation = np.sqrt(np.sum((values - trend) ** 2, axis=0) / (len(time) - _ORDER - 1))
     deviation[(values == values[0]).all(axis=0)] = 0.0  # the fit leaves rounding errors
     rough = np.median(np.abs(np.diff(values, 2, axis=0)), axis=0) * _TO_DEVIATION

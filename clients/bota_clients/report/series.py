@@ -406,7 +406,8 @@ class Series:
         moved = intervals - np.diff(stamps, prepend=was_stamp_ns)
         steps = -moved[(np.abs(moved) > _STEP_NS) & real] * 1e-9
         self.clock_steps += len(steps)
-        self.largest_step = max([self.largest_step, *steps[np.abs(steps).argsort()[-1:]].tolist()], key=abs)
+        if len(steps):
+            self.largest_step = max(self.largest_step, float(steps[np.abs(steps).argmax()]), key=abs)
         self.lost += int(lost[real].sum())
         self.backwards += int((intervals[real] <= 0).sum())
         limit_ns = _LONG * self.period * 1e9
