@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from bota_ethercat.pdo import Sample, Vector3
+from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.stream.timeline import InForce
@@ -21,9 +22,12 @@ from bota_ft_compensation.quantities import (
     Accelerometer,
     Matrix,
     Turning,
+    length,
 )
 from bota_ft_compensation.specific_force import ImuSpecificForce
 
+# Of a check of gravity: looks, s apart; rad/s, and m/s² between looks, that are rest; m/s² that is wrong.
+_LOOKS, _APART_S, _RESTING, _STEADY, _WRONG = 3, 0.5, 0.1, 0.3, 2.0
 IMU_IS_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
 
 
@@ -115,3 +119,45 @@ class ImuSource(Source):
         if not any(sample.acceleration):
             return IMU_IS_OFF
         return "" if sample.is_finite else "the IMU sends NaN or infinity: see the status stream"
+
+
+class GravityCheck:
+    """Whether gravity by a source looks right to the sensor's accelerometer, while the sensor is at rest."""
+
+    def __init__(self) -> None:
+        self._looks = deque[tuple[float, Vector3, Vector3]](maxlen=_LOOKS)
+        self.problem = ""  # what is wrong and what to do, a clause
+
+    def look(self, sample: Sample, felt: Vector3 | None, time_s: float, *, by_imu: bool) -> None:
+        """About once a second, with a sample and the specific force that the source gave for it, m/s²."""
+        looks, read = self._looks, sample.acceleration
+        if looks and 0.0 <= time_s - looks[-1][0] < _APART_S:
+            return
+        if felt is None or not any(read) or not sample.is_finite or length(sample.angular_rate) > _RESTING:
+            looks.clear()
+            return
+        looks.append((time_s, read, felt))
+        first, *rest = looks
+        if len(looks) == _LOOKS and all(
+            math.dist(a, b) < _STEADY for each in rest for a, b in zip(each[1:], first[1:], strict=True)
+        ):
+            self.problem = _gravity_problem(read, felt, by_imu=by_imu)
+
+
+def _gravity_problem(read: Vector3, felt: Vector3, *, by_imu: bool) -> str:
+    size, told = length(read), length(felt)
+    if abs(size - STANDARD_GRAVITY) > _WRONG:
+        return f"the accelerometer reads {size:.2g} m/s² at rest, where gravity is 9.81: check imu_raw_units"
+    if abs(told - STANDARD_GRAVITY) > _WRONG:
+        wrong = "accelerometer.offset and accelerometer.scale" if by_imu else "gravity"
+        return (
+            f"gravity is taken for {told:.2g} m/s², where the accelerometer reads {size:.2g}: check {wrong}"
+        )
+    if by_imu or math.dist(read, felt) < _WRONG:
+        return ""
+    cosine = sum(a * b for a, b in zip(read, felt, strict=True)) / (size * told)
+    angle = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+    return (
+        f"gravity by the robot's orientation is {angle:.0f}° from the accelerometer's: check the signs of "
+        "gravity and orientation, orientation.mounting, and how the robot's base is mounted"
+    )

@@ -62,7 +62,8 @@ class Compensation:
         published, withheld: samples since the node started that were compensated, and that were not.
         why_withheld: of the latest of these; empty: the source knew nothing.
         is_stopped: whether the latest sample could not be compensated.
-        sample, time_s, stamp_s: the latest, its time by the server's monotonic clock and since 1970.
+        sample, felt, time_s, stamp_s: the latest, its specific force, its time by the server's monotonic
+            clock and since 1970.
     """
 
     parts = (WRENCH,)
@@ -101,6 +102,7 @@ class Compensation:
         self.why_withheld = ""
         self.decode = decoder(parameters).sample
         self.sample: Sample | None = None
+        self.felt: Vector3 | None = None  # by it
         self.time_s = self.stamp_s = 0.0
         self.configure(parameters)
 
@@ -127,7 +129,8 @@ class Compensation:
         self.time_s, self.stamp_s = time_s, stamp_s
         window, stream = self.window, self.stream
         if window is None or window.done.is_set():
-            return stream.feel(sample, time_s, stamp_s)
+            self.felt = stream.feel(sample, time_s, stamp_s)
+            return self.felt
         felt = stream.feel(sample, time_s, stamp_s, always=True)
         window.observe(sample, time_s, stamp_s, felt)
         return felt if stream.plan.has_tool else ZERO

@@ -29,7 +29,7 @@ from bota_ft_compensation.identification.weighted import (
 from bota_ft_compensation.quantities import NORMAL_95, OFFSET_PRIOR, SCALE_PRIOR
 
 # m/s²: what is assumed of the length of a mean acceleration beyond offset and sensitivities, ...
-_LENGTH_DEVIATION: Final = 0.001
+_LENGTH_DEVIATION: Final = 0.0005
 _LENGTH_DEGREES: Final = 6.0  # ... as if it were estimated from so many residuals.
 _NOISE_DEGREES: Final = 30.0  # likewise of force and torque, where the windows' noise explains what is left
 # N, Nm, m/s²: standard deviations below which nothing is believed, where equations of all kinds meet.
