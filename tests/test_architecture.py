@@ -81,7 +81,8 @@ ROOMS: Final[dict[str, set[str]]] = {
     # Programs that are ordinary clients of the server.
     "bota_clients": {"bota_clients"} | PROTOCOL,
     "bota_clients.recording": CLIENTS,
-    "bota_clients.export": CLIENTS | {"bota_clients.export", "bota_clients.identify", C},
+    "bota_clients.export": CLIENTS
+    | {"bota_clients.export", "bota_clients.identify", "bota_ethercat.client", C},
     "bota_clients.record": CLIENTS | {"bota_clients.record"},
     "bota_clients.report": CLIENTS | {"bota_clients.report", "bota_clients.record"},
     "bota_clients.monitor": CLIENTS

@@ -16,7 +16,7 @@ from bota_ethercat.control import Event, event
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.acquisition.acyclic import Acyclic, Task
-from ethercat_server.acquisition.loss_causes import LossCauses
+from ethercat_server.acquisition.sensor_loss_causes import SensorLossCauses
 from ethercat_server.acquisition.stream import SensorStream
 from ethercat_server.errors import BusError, extended
 from ethercat_server.ethercat.bus import Bus
@@ -381,7 +381,7 @@ class Recovery:
     ) -> None:
         self.bus, self.acyclic, self.announce = bus, acyclic, announce
         self._all, self._streams, self._others = sensors, streams, others
-        self.causes = LossCauses(bus.ifname)
+        self.causes = SensorLossCauses(bus.ifname)
         self.sensors = [
             SensorRecovery(self, sensor, stream) for sensor, stream in zip(sensors, streams, strict=True)
         ]

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Final
 
 from bota_ethercat.program.signals import Signals
 from ethercat_server.daemon.histories import kept
+from ethercat_server.daemon.loss_traces import LossTraces
 from ethercat_server.daemon.options import ServerOptions
-from ethercat_server.daemon.traces import Traces
 from ethercat_server.errors import StopRequestedError
 from ethercat_server.ethercat.nic import check_unused
 from ethercat_server.ethercat.soem import open_bus
@@ -67,7 +67,7 @@ def serve(options: ServerOptions, signals: Signals, virtual: VirtualBus | None =
                 raise StopRequestedError("stopped during start-up")
 
         server = Server(bus, hub, options, check_interrupt, watchdog=notifier)
-        server.cycle.every_second = partial(every_second, server, notifier, Traces(server))
+        server.cycle.every_second = partial(every_second, server, notifier, LossTraces(server))
         signals.call(server.stop)
         for sensor in server.sensors:
             log.info(
@@ -89,7 +89,7 @@ def serve(options: ServerOptions, signals: Signals, virtual: VirtualBus | None =
         log.info("shutting down: the sensors go to INIT")
 
 
-def every_second(server: Server, notifier: SystemdNotifier, traces: Traces) -> None:
+def every_second(server: Server, notifier: SystemdNotifier, traces: LossTraces) -> None:
     """What the loop has done once a second.
 
     Nothing should be left in reference cycles. For what is all the same, a look at what was made since the

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Was the sensor stationary for the whole of a window, and what did it read meanwhile?
 
-The one criterion of tare and identification, live and in recordings (docs/compensation.md). Standard
-deviations see what shakes or is touched, drift a cable that settles or a robot that creeps, the mean angular
+The criterion of the node's tare and of identification (docs/compensation.md). Standard deviations
+see what shakes or is touched, drift a cable that settles or a robot that creeps, the mean angular
 rate a turn about the vertical. One bad sample spoils the window. The server's own tare has another
 criterion, by the same limits: it knows no IMU's calibration.
 """

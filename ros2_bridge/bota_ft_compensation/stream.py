@@ -4,8 +4,7 @@
 The one place for the node, `ethercat-export --tool`, `ethercat-monitor --tool` and `ethercat-identify`; the
 ros2_control plugin does the same in C++ (compensation.hpp, sensor_loop.hpp). What is in force for the samples
 comes from the timeline (`bota_ethercat.stream.timeline`), which of them may be used from its table
-(`usable`). No threads, no ROS, no clock. The sensor adds an offset of its own (object 0x8000) to every
-sample; a tare of the sensor, another client, or a power cycle changes it, and a bias with it.
+(`usable`). No threads, no ROS, no clock.
 """
 
 from __future__ import annotations
@@ -35,10 +34,10 @@ from bota_ft_compensation.bounds import Bounds, at_reference
 from bota_ft_compensation.compensator import Compensator, Stages
 from bota_ft_compensation.contact import ContactDetector, Surface, detector_of
 from bota_ft_compensation.imu import IMU_IS_OFF, ImuSource, Source
+from bota_ft_compensation.own_offset import OwnOffset
 from bota_ft_compensation.quantities import (
     EXACT,
     NO_PAYLOAD,
-    NO_WRENCH,
     STILL,
     UNKNOWN_ACCURACY,
     ZERO,
@@ -54,43 +53,6 @@ _UNKNOWN: Final = (math.nan,) * 3
 _ROUNDING_S: Final = 1e-6
 _BEING_CHANGED: Final = "the sensor's own offset was being changed"
 _BY_IMU: Final = (FORCE_TORQUE, ACCELERATION, ANGULAR_RATE)  # what weight and inertia by the IMU need
-
-
-class OwnOffset:
-    """How changes of the sensor's own offset affect a bias; offsets in N and Nm.
-
-    None: unknown. So is one that is being changed: the server says so before it writes the first number.
-    """
-
-    def __init__(self) -> None:
-        self.of_bias: Wrench | None = None  # the offset that the bias goes with, or the last without a bias
-        self._appeared = False  # whether the offset became known only after the bias was taken
-        # Whether there is a bias. Zero may be one: what a tare finds where the sensor reads nothing.
-        self.has_bias = False
-
-    def begin(self, bias: Wrench, offset: Wrench | None, *, is_measured: bool = False) -> None:
-        """`bias` goes with this offset. Zero is no bias, unless it was measured."""
-        self.has_bias = is_measured or bias != NO_WRENCH
-        self.of_bias, self._appeared = offset, False
-
-    def follow(self, now: Wrench | None) -> Wrench | None:
-        """The shift of the bias that the current offset requires, once; None: the offset is as it was."""
-        before = self.of_bias
-        if now is None or now == before:
-            return None
-        self.of_bias = now
-        if before is None:
-            self._appeared = self.has_bias
-            return None
-        return now.plus(before, -1.0) if self.has_bias else NO_WRENCH
-
-    def doubt(self, now: Wrench | None) -> str:
-        """Why samples with this offset cannot be compensated, a sentence; empty if they can."""
-        if self._appeared:
-            return "the sensor's own offset was unknown when the bias was taken: the bias may be wrong, tare"
-        if self.of_bias is not None and now is None:
-            return "the sensor's own offset is being changed, or is no longer known: if this lasts, tare"
-        return ""
 
 
 def obstacle(settings: Settings, *, has_tool: bool, by_imu: bool) -> str:

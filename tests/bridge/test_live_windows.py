@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from bota_clients.export.dataset import Stamped, windows_of
+from bota_clients.export.live import LiveWindows
 from bota_clients.export.windows import Arrays, Windows, read_tool
-from bota_clients.live import LiveWindows
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.client import Client
 from bota_ethercat.framing import DataMessage, encode_data, encode_json

@@ -15,8 +15,8 @@ import pytest
 
 from bota_ethercat.control import ACTIONS, Parameter
 from bota_ethercat.text.json_text import JsonObject
+from ethercat_server.daemon.loss_traces import LossTraces
 from ethercat_server.daemon.server import SystemdNotifier, every_second
-from ethercat_server.daemon.traces import Traces
 from ethercat_server.serving.connection import Connection
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.simulation import Client, Simulation, more_if_long
@@ -113,7 +113,7 @@ def test_what_a_defect_leaves_in_cycles_is_freed_within_a_second() -> None:
         return {}
 
     simulation.hub.start(defective)
-    traces = Traces(simulation.server)
+    traces = LossTraces(simulation.server)
     simulation.cycle.every_second = partial(every_second, simulation.server, SystemdNotifier(), traces)
     client = simulation.connect()
     for _ in range(5):

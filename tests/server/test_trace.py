@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from ethercat_server.daemon.traces import Traces
+from ethercat_server.daemon.loss_traces import LossTraces
 from ethercat_server.doctor.cli import main as doctor
 from ethercat_server.doctor.trace import find_losses, show
 from ethercat_server.sampling.replay import Decision, Record, Trace, TraceError
@@ -276,7 +276,7 @@ def test_a_loss_that_nothing_explains_leaves_a_trace_and_few_of_them(
 ) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
     simulation = Simulation(settings={"sinc_length": 512})
-    traces = Traces(simulation.server)
+    traces = LossTraces(simulation.server)
     written = []
 
     def second(command: str = "") -> None:

@@ -5,8 +5,8 @@ A REPEATED or INVALID frame brings no sample. Of a sample each channel is judged
 saturation field and by the warnings register, either of which counts alone. A saturated channel reads less
 than there is, with the right sign. Values of a faulty one mean nothing: the ADC that measures force and
 torque is out of sync, or the supply voltage of the whole sensor is wrong. Overtemperature and reserved bits
-forbid nothing. The C++ header has the same (`usability`), and tests/protocol/golden/usable.json holds both to
-the table.
+forbid nothing. The C++ header has the same (`usability`); tests/corpus.py and
+tests/protocol/golden/readings.json hold both to the table.
 """
 
 from __future__ import annotations

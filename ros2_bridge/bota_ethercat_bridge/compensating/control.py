@@ -27,6 +27,7 @@ from bota_ethercat_bridge.stream.reader import Reader
 from bota_ft_compensation.bias import BiasRamp, TareBasis
 from bota_ft_compensation.imu import GravityCheck, Source
 from bota_ft_compensation.outputs import cutoff_problem
+from bota_ft_compensation.own_offset import OwnOffset
 from bota_ft_compensation.quantities import (
     NO_WRENCH,
     STILL,
@@ -36,7 +37,7 @@ from bota_ft_compensation.quantities import (
     Wrench,
     wrench_text,
 )
-from bota_ft_compensation.stream import OwnOffset, Plan, obstacle
+from bota_ft_compensation.stream import Plan, obstacle
 
 _FROM_PARAMETER: Final = "parameter"
 _MEASURED: Final = ("tare", "identified")  # where a bias comes from that is one even if it is zero

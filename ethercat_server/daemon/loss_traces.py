@@ -25,7 +25,7 @@ _PART: Final = 64 << 10  # bytes written at once
 log = logging.getLogger(__name__)
 
 
-class Traces:
+class LossTraces:
     """Those of a server. `each_second` is to be called in the loop."""
 
     def __init__(self, server: Server) -> None:

@@ -11,7 +11,7 @@ from ethercat_server.ethercat.other_master import RECENT_NS, OtherMaster
 _STALL_NS: Final = 20_000_000
 
 
-class LossCauses:
+class SensorLossCauses:
     """On the bus of an interface."""
 
     def __init__(self, ifname: str) -> None:
