@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,10 +27,15 @@ from bota_clients.export.dataset import Periodic, Stamped, messages, read_stamps
 from bota_clients.export.windows import Array, Arrays, Windows
 from bota_clients.recording.columns import columns
 from bota_clients.recording.reader import open_recording
+from bota_ethercat import client
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.stream.timeline import InForce
+from bota_ft_compensation.identification.parameter_file import write_payload
+from bota_ft_compensation.quantities import Payload
+from ethercat_server.simulation.server import MemoryChannel, Simulation
+from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.clients.bags import imu, write_bag
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, write
 from tests.clients.simulated import simulate
@@ -357,6 +363,8 @@ def test_the_code_of_the_pages_runs(code: str, tmp_path: Path, monkeypatch: pyte
         made.save_episode()
         made.finalize()
     found: dict[str, Any] = {}
+    if "LiveWindows" in code:
+        return _run_live(code, monkeypatch)
     exec(code, found)
     if zipped := re.search(r"# zipped: (.*)$", code, re.MULTILINE):
         other = found["zarr"].open_group(eval(zipped[1], found), mode="r")
@@ -366,6 +374,27 @@ def test_the_code_of_the_pages_runs(code: str, tmp_path: Path, monkeypatch: pyte
     if "lerobot" in code:
         dataset = found["LeRobotDataset"]("me/with_force", root="with_force")
         _check_lerobot(dataset, np.load("run.npz"))
+
+
+def _run_live(code: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a simulated server, for three images."""
+    server, acted = Simulation(SensorOptions(signal="scene")), list[Any]()
+    monkeypatch.setattr(
+        client, "connect", lambda port: client.Client(port, channel=MemoryChannel(server)).connect()
+    )
+    write_payload(Path("tool.yaml"), Payload(0.8, (0.004, -0.006, 0.055)), "", ())
+
+    def read() -> tuple[str, int]:
+        if len(acted) == 3:
+            raise EOFError
+        server.run(0.1)
+        return "image", server.clock.time_ns()
+
+    camera = SimpleNamespace(read=read)
+    with pytest.raises(EOFError):
+        exec(code, {"camera": camera, "policy": lambda *given: given, "act": acted.append})
+    assert {(image, wrench.shape) for image, wrench, _ in acted} == {("image", (64, 6))}
+    assert [int(valid.sum()) > 50 for *_, valid in acted] == [False, True, True]
 
 
 def _check_lerobot(dataset: Any, arrays: Any) -> None:
@@ -540,6 +569,7 @@ def test_every_type_that_a_table_can_hold(tmp_path: Path, empty: int | None) -> 
         (["1700000000100000"], (), "it seems to be us since 1970: give integers in ns"),
         (["0", "0"], (), "the times of timestamp in {} are all 0: what wrote them, a camera's driver or"),
         (["0", f"{START_NS + 10**8}"], (), "its time was not set (0): leave the row out"),
+        (["0.0", "0.033"], (), "its times are of no clock (LeRobot's are frame_index / fps): keep the"),
         ([0.1, ""], (), "row 1 (counted from 0) is empty"),
         ([1.0], ("--column", "t"), "{} has no times in a column t (choose"),
         ([1.0], ("--tool", "{}"), "{} does not have a tool's parameters"),

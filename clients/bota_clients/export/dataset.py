@@ -56,6 +56,7 @@ _SECOND: Final = 1_000_000_000
 _PER_SECOND: Final = {"s": _SECOND, "ms": 1_000_000, "us": 1000, "ns": 1}
 _FIRST: Final = -(1 << 63)
 _COARSEST_S: Final = 0.001
+_DAY_NS: Final = 10**14  # after 1970: earlier times count from the start of something
 _NEAR_NS: Final = 366 * 86400 * _SECOND
 MOST_LEFT_OUT: Final = (
     0.1  # of rows or messages, because of their order: with more it is the stamps that are wrong
@@ -216,6 +217,10 @@ class Stamped:
         what = f"leave the row out, or find the offset of its clock with '{_ALIGN}'"
         if not stamps[row]:
             what = "its time was not set (0): leave the row out"
+        if self._clock is None and stamps.max() < _DAY_NS:
+            what = (
+                "its times are of no clock (LeRobot's are frame_index / fps): keep the cameras' own, --column"
+            )
         for unit, per_unit in _PER_SECOND.items():
             if unit != "ns" and abs(int(stamps[row]) * per_unit - bound) < _NEAR_NS:
                 what = f"it seems to be {unit} since 1970: give integers in ns, or numbers with a point in s"
