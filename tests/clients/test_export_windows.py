@@ -364,8 +364,9 @@ def test_the_code_of_the_pages_runs(code: str, tmp_path: Path, monkeypatch: pyte
         made.finalize()
     found: dict[str, Any] = {}
     if "LiveWindows" in code:
-        return _run_live(code, monkeypatch)
-    exec(code, found)
+        _run_live(code, monkeypatch)
+    else:
+        exec(code, found)
     if zipped := re.search(r"# zipped: (.*)$", code, re.MULTILINE):
         other = found["zarr"].open_group(eval(zipped[1], found), mode="r")
         np.testing.assert_array_equal(other["force_torque"][:], found["force_torque"])
@@ -394,7 +395,7 @@ def _run_live(code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(EOFError):
         exec(code, {"camera": camera, "policy": lambda *given: given, "act": acted.append})
     assert {(image, wrench.shape) for image, wrench, _ in acted} == {("image", (64, 6))}
-    assert [int(valid.sum()) > 50 for *_, valid in acted] == [False, True, True]
+    assert [int(valid.sum()) > 50 for *_, valid in acted] == [True] * 3
 
 
 def _check_lerobot(dataset: Any, arrays: Any) -> None:
