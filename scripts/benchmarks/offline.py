@@ -24,23 +24,26 @@ _RATE_HZ: Final = 800
 _FLUSHED: Final = 320  # frames, every 0.4 s
 _ROUNDS: Final = 3
 _COLUMNS: Final = """
-from bota_clients.recording.reader import open_recording
-with open_recording(Path(given)) as recording:
+from bota_clients.recording import columns, reader
+BEGIN
+with reader.open_recording(Path(given)) as recording:
     if hasattr(recording, "columns"):
         recording.columns(0)
     else:
-        from bota_clients.recording.columns import columns
-        columns(recording.frames(0))"""
+        columns.columns(recording.frames(0))"""
 _PEERS: Final = {  # by package
     "mcap": """
 from mcap.reader import make_reader
+BEGIN
 for schema, channel, message in make_reader(open(given, "rb")).iter_messages(): pass""",
     "mcap-ros2-support": """
 from mcap_ros2.reader import read_ros2_messages
+BEGIN
 for message in read_ros2_messages(given): message.ros_msg""",
     "rosbags": """
 from rosbags.highlevel import AnyReader
 import numpy
+BEGIN
 with AnyReader([Path(given)]) as bag:
     chosen = [each for each in bag.connections if each.topic == "/ethercat/sensor_0/frames"]
     made = [bag.deserialize(data, each.msgtype) for each, _, data in bag.messages(chosen)]
@@ -91,20 +94,22 @@ def make(path: Path, minutes: float) -> int:
 
 
 def cost(root: Path, code: str, *arguments: str) -> tuple[float, float]:
-    """CPU, s, and the most memory, MB, of code in a process of its own, with the packages of a checkout."""
+    """CPU, s, and the most memory, MB, of a process with the packages of a checkout; CPU from BEGIN on."""
     folders = [root, *(root / name for name in ("protocol", "clients", "ros2_bridge"))]
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(map(str, folders)),
         "OPENBLAS_NUM_THREADS": "1",
     }
-    text = f"import sys; from pathlib import Path; given, out = sys.argv[1:3]\n{code}"
+    text = f"import sys, time; from pathlib import Path; given, out = sys.argv[1:3]; begun = 0.0\n{code}"
+    text = text.replace("BEGIN", "begun = time.process_time()")
+    text += "\nPath(out).write_text(str(time.process_time() - begun))"
     process = os.posix_spawn(
         sys.executable, [sys.executable, "-c", text, *arguments], environment,
         file_actions=[(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0), (os.POSIX_SPAWN_DUP2, 1, 2)],
     )  # fmt: skip
     _, _, used = os.wait4(process, 0)
-    return used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
+    return float(Path(arguments[1]).read_text()), used.ru_maxrss / 1024
 
 
 def _show(cells: Sequence[str]) -> None:

@@ -334,8 +334,12 @@ DOCS = Path(__file__).parents[2] / "docs"
 PAGES = (DOCS / "datasets.md").read_text() + (DOCS / "recording.md").read_text()
 
 
+@pytest.mark.timeout(600)  # a cluster of Ray begins
+@pytest.mark.filterwarnings("ignore:::ray", "ignore:::dask")
 @pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", PAGES, re.DOTALL))
-def test_the_code_of_the_pages_runs(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_code_of_the_pages_runs(
+    code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
     for package in re.findall(r"^(?:import|from) (\w+)", code, re.MULTILINE):
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
@@ -350,7 +354,10 @@ def test_the_code_of_the_pages_runs(code: str, tmp_path: Path, monkeypatch: pyte
     shutil.copy("run.mcap", "runs")
     if "import ray" in code:  # a cluster of two workers
         monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
-        importlib.import_module("ray").init(num_cpus=2, include_dashboard=False)
+        monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+        ray = importlib.import_module("ray")
+        ray.init(num_cpus=2, include_dashboard=False)
+        request.addfinalizer(ray.shutdown)
     if "lerobot" in code:
         lerobot, state = (
             importlib.import_module("lerobot.datasets.lerobot_dataset"),
