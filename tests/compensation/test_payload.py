@@ -439,7 +439,7 @@ def test_ros_reads_every_number_as_a_float(tmp_path: Path) -> None:
     write_yaml(path, result, gravity=(0.0, 0.0, -10.0))
     text = path.read_text()
     numbers = re.findall(r"[\[ ](-?[\d][^,\]\s]*)", re.sub("#.*", "", text))
-    assert len(numbers) == 28
+    assert len(numbers) == 40
     for number in numbers:
         assert re.fullmatch(r"-?\d+\.\d+", number), number
 
