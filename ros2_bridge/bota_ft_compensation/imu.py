@@ -104,16 +104,18 @@ class ImuSource(Source):
         return self._imu.alignment
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
-        return self.follow(sample.acceleration, sample.angular_rate, time_s)
+        found = self._imu.follow(sample.acceleration, sample.angular_rate, time_s)
+        self.turning = self._imu.turning
+        if found is None or not any(sample.acceleration):
+            return None
+        self.felt = found
+        return found
 
     def follow(self, acceleration: Vector3, angular_rate: Vector3, time_s: float) -> Vector3 | None:
         """As `specific_force`, of a sample's m/s² and rad/s."""
         found = self._imu.follow(acceleration, angular_rate, time_s)
         self.turning = self._imu.turning
-        if found is None or not any(acceleration):
-            return None
-        self.felt = found
-        return found
+        return found if any(acceleration) else None
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         if not any(sample.acceleration):

@@ -56,8 +56,12 @@ class ImuSpecificForce:
         self.lever = lever
         # Angular rate (rad/s) and acceleration (rad/s²) of the latest sample, at force and torque's instant.
         self.turning = STILL
-        self._correct = accelerometer.correct
-        self._gyroscope = None if gyroscope == IDENTITY else gyroscope
+        # What is read is corrected once it is aligned, which is linear, and exact of what is constant.
+        self._base = accelerometer.correct(ZERO)
+        self._corrected = np.zeros((6, 6))
+        axes = (accelerometer.correct(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+        self._corrected[:3, :3] = np.array([*axes]) - self._base
+        self._corrected[3:, 3:] = np.reshape(gyroscope, (3, 3)).T
         self.align(alignment or align({}))
 
     def align(self, alignment: Alignment) -> None:
@@ -75,12 +79,7 @@ class ImuSpecificForce:
         None if it is not finite, or if the sensor moves, or did before a gap, and what was just before the
         sample, and so how fast it spins up, is not known.
         """
-        if self._gyroscope:
-            (wx, wy, wz), (xx, xy, xz, yx, yy, yz, zx, zy, zz) = angular_rate, self._gyroscope
-            angular_rate = (
-                xx * wx + xy * wy + xz * wz, yx * wx + yy * wy + yz * wz, zx * wx + zy * wy + zz * wz,
-            )  # fmt: skip
-        row = (*self._correct(acceleration), *angular_rate)
+        row = (*acceleration, *angular_rate)
         total = sum(row)
         if total - total != 0.0:  # NaN or infinity
             self._time_s = -math.inf
@@ -103,14 +102,17 @@ class ImuSpecificForce:
             self._ring[:] = row
         if self._filled < lead and (dx or dy or dz) and (self._moved or _turns(angular_rate)):
             return None
-        found = self.alignment.taps.dot(self._ring[self._at + 1 : self._at + self._size + 1]).tolist()
-        (ax, ay, az, _, _, _), (_, _, _, wx, wy, wz), (_, _, _, tx, ty, tz) = found
+        found = self.alignment.taps.dot(self._ring[self._at + 1 : self._at + self._size + 1])
+        (ax, ay, az, _, _, _), (_, _, _, wx, wy, wz), (_, _, _, tx, ty, tz) = found.dot(
+            self._corrected
+        ).tolist()
+        bx, by, bz = self._base
         self.turning = (wx, wy, wz), (tx, ty, tz)
         vx, vy, vz = wy * dz - wz * dy, wz * dx - wx * dz, wx * dy - wy * dx
         return (
-            ax + ty * dz - tz * dy + wy * vz - wz * vy,
-            ay + tz * dx - tx * dz + wz * vx - wx * vz,
-            az + tx * dy - ty * dx + wx * vy - wy * vx,
+            ax + bx + ty * dz - tz * dy + wy * vz - wz * vy,
+            ay + by + tz * dx - tx * dz + wz * vx - wx * vz,
+            az + bz + tx * dy - ty * dx + wx * vy - wy * vx,
         )
 
     def _bridge(self, row: Row, passed_s: float) -> None:

@@ -147,7 +147,7 @@ class CompensatedStream:
         Zero without a tool, unless `always`. Every new sample is to come here, in order; `time_s` is by the
         server's monotonic clock, `stamp_s` since 1970.
         """
-        source, payload, *_ = self.plan
+        source, payload, _, _, _ = self.plan
         in_force, self._newest_s = self.in_force, time_s
         if payload.mass <= 0.0 and not always:
             return ZERO
@@ -180,7 +180,7 @@ class CompensatedStream:
 
     def stages(self, sample: Any, time_s: float, felt: Vector3, turning: Turning | None = None) -> Stages:
         """Every stage of a sample in which `felt` was felt. Components may be arrays of samples."""
-        (source, payload, ramp, *_), compensator = self.plan, self._compensator
+        (source, payload, ramp, _, _), compensator = self.plan, self._compensator
         compensator.payload, compensator.bias = payload, ramp.at(time_s)
         if turning is None:
             turning = source.turning

@@ -215,11 +215,12 @@ def run(options: argparse.Namespace) -> int:
         result: Identified | None = _in_motion(motion, sensor, still)
         poses = poses if still else ()
     except CompensationError as refusal:
-        result, alone = None, "with motion" if still else "by motion alone"
-        if still is not None and error is None:
+        result = None
+        if error is not None:
+            error = f"{error}; or, {'with motion' if still else 'by motion alone'}: {refusal}"
+        elif still is not None:
             note = f"the tool's inertia is not identified: {refusal}"
             result = still._replace(notes=(note, *still.notes))
-        error = f"{error}; or, {alone}: {refusal}"
     if result is not None:
         _write_files(options, result, sensor, offset)
     if options.json:
