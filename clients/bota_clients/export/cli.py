@@ -58,7 +58,9 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     options = made.parse_intermixed_args(argv)
     has_frames = options.at is not None or options.fps is not None
     outputs: list[str] = options.output
-    is_folder = len(outputs) > 1 or any(each.endswith("/") or Path(each).is_dir() for each in outputs)
+    is_folder = len(outputs) > 1 or any(
+        each.endswith("/") or (Path(each).is_dir() and not Path(each).suffix) for each in outputs
+    )
     options.recordings = [options.recording, *map(Path, outputs[:-1])] if is_folder else []
     options.output = Path(outputs[-1]) if outputs else None
     if is_folder:
