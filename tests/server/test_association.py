@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import pytest
 
@@ -93,3 +94,113 @@ def test_what_event_times_are_worth_changes_by_the_table_only(state: TrustState,
         with pytest.raises(KeyError):
             trust._enter(evidence)
         assert trust.state is state
+
+
+MS, MINUTE = 10**6, 60 * 10**9
+
+
+def tried(
+    now_ns: int, count: int = 99, unfit: int = 1, difference_ns: float = 0.0, trust: Trust | None = None
+) -> Trust:
+    """After a trial that ends then, with so many events that fit, and that do not."""
+    trust = trust or Trust()
+    trust.judge(1.0, now_ns - 500 * MS, 0)
+    for number in range(count + unfit):
+        trust.compare(difference_ns if number < count else None, is_new=True, counts=True)
+    trust.judge(1e6, now_ns, 0)
+    return trust
+
+
+@pytest.mark.parametrize(
+    ("made", "state", "why"),
+    [
+        ({}, TrustState.TRUSTED, ""),
+        ({"count": 98}, TrustState.TRIAL, ""),
+        ({"count": 98, "unfit": 2}, TrustState.TRIAL, "they contradict the frames"),
+        ({"difference_ns": 3000.0}, TrustState.TRUSTED, ""),
+        (
+            {"difference_ns": -3001.0},
+            TrustState.TRIAL,
+            "they differ from what polling shows by -3 µs",
+        ),
+    ],
+)
+def test_a_trial_is_of_so_many_events_that_fit_so_well(
+    made: dict[str, Any], state: TrustState, why: str
+) -> None:
+    trust = tried(1000 * MS, **made)
+    assert (trust.state, trust.why) == (state, why)
+
+
+def test_a_trial_takes_its_time_and_needs_events_that_move() -> None:
+    trust = Trust()
+    for number in range(200):
+        trust.compare(2.0, is_new=True, counts=True)
+        found = trust.judge(1e6, 1000 * MS + number * 4 * MS, 0)
+        assert bool(found) == trust.is_trusted == (number == 125), "the time before the first does not count"
+        if found:
+            assert found == 4.0
+            break
+    still = Trust()
+    still.judge(1e6, 1, 0)
+    for _ in range(100):
+        still.compare(None, is_new=False, counts=True)
+    assert still.judge(1e6, 500 * MS + 1, 4) == 0.0
+    assert (still.state, still.why) == (TrustState.ABSENT, "they stand still")
+    for restarts, state in ((4, TrustState.TRIAL), (5, TrustState.ABSENT)):
+        jumps = Trust()
+        jumps.judge(1e6, 1, 7)
+        jumps.judge(1e6, 500 * MS + 1, 7 + restarts)
+        assert jumps.state is state
+    assert jumps.why == "its local clock does not run"
+
+
+def test_contradictions_end_trust_and_each_trial_that_fails_doubles_the_pause() -> None:
+    trust, now_ns = tried(1000 * MS), 1000 * MS
+    for failure in range(1, 6):
+        for number in range(5):
+            assert trust.is_trusted
+            assert trust.is_steady == (number == 0)
+            trust.contradict(now_ns, 0)
+        if failure < 5:
+            tried(now_ns := now_ns + 1000 * MS, trust=trust)
+    for pause_s in (10, 20, 40, 80, 160, 320, 320):
+        assert (trust.state, trust.is_steady) == (TrustState.REFUSED, False)
+        assert not trust.is_due(now_ns + pause_s * 1000 * MS - 1)
+        assert trust.is_due(now_ns := now_ns + pause_s * 1000 * MS)
+        trust.retry()
+        assert not trust.is_due(now_ns)
+        tried(now_ns := now_ns + 1000 * MS, unfit=2, trust=trust)
+
+
+@pytest.mark.parametrize(("trusted_ns", "failures"), [(MINUTE, 1), (MINUTE + 1, 5)])
+def test_what_was_trusted_for_long_has_no_failures_behind_it(trusted_ns: int, failures: int) -> None:
+    trust, now_ns = Trust(), 0
+    for _ in range(4):
+        tried(now_ns := now_ns + 1000 * MS, unfit=2, trust=trust)
+    for _ in range(failures):
+        assert trust.state is TrustState.TRIAL
+        tried(now_ns := now_ns + 1000 * MS, trust=trust)
+        now_ns += trusted_ns if not trust.contradictions else 0
+        trusted_ns = 0
+        for _ in range(5):
+            trust.contradict(now_ns, 0)
+    assert trust.state is TrustState.REFUSED
+
+
+def test_a_contradiction_is_outweighed_by_a_hundred_samples() -> None:
+    trust = tried(1000 * MS)
+    for _ in range(4):
+        trust.contradict(1000 * MS, 0)
+    for _ in range(400):
+        assert not trust.is_steady
+        trust.confirm()
+    trust.confirm()
+    assert trust.is_steady
+    for _ in range(100):
+        trust.confirm()
+    for _ in range(4):
+        trust.contradict(1000 * MS, 0)
+    assert trust.is_trusted, "more than none is no credit"
+    trust.contradict(1000 * MS, 0)
+    assert not trust.is_trusted
