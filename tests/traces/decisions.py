@@ -61,20 +61,27 @@ def decisions(name: str) -> dict[str, int]:
 
 KNOWN: Final = (
     "next_poll_ns", "next_in_flight_ns", "next_unanswered_ns", "uncertainty_ns", "period_error_ns",
-    "patience_ns", "taking_over_ns", "late_ns", "local_doubt_ns", "local_moved_ns",
+    "phase_deviation_ns", "patience_ns", "taking_over_ns", "late_ns", "lacks_event_ppm", "local_doubt_ns",
+    "local_moved_ns", "local_short_ns", "local_excess_ns", "local_rate_ppt",
 )  # fmt: skip
 
 
 def _known(clocks: Clocks, step: Decision) -> Iterator[float]:
-    """Each of `KNOWN`, after a record."""
+    """Each of `KNOWN`, after a record; 0 for what is not known."""
     clock, round_trip, sent_ns = clocks.sensors[step.record.sensor], clocks.round_trip, step.record.sent_ns
     for unanswered, in_flight in (0, False), (0, True), (2, True):
         yield clock.next_poll_ns(sent_ns, unanswered, in_flight=in_flight) - sent_ns
     yield clock.uncertainty_ns if math.isfinite(clock.uncertainty_ns) else 0.0
     yield clock.period_ns - clock.phase._nominal_ns
+    yield math.sqrt(clock.phase.variance)
     yield from (round_trip.patience_ns, round_trip.taking_over_ns, round_trip.late_ns)
-    local = clock.events.local_clock if clock.events else None
-    yield from (local.doubt_ns, local.moved_ns) if local else (0.0, 0.0)
+    yield 1e6 * (clock.events is not None and clock.events.lacks_event)
+    if local := clock.events and clock.events.local_clock:
+        short_ns = local.short_ns if math.isfinite(local.short_ns) else 0.0
+        yield from (local.doubt_ns, local.moved_ns, short_ns, local.excess_ns)
+        yield 1e12 * (local.phase.period_ns - 1)
+    else:
+        yield from (0.0,) * 5
 
 
 if __name__ == "__main__":
