@@ -8,7 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from unittest import mock
 
 from ethercat_server.sampling.replay import Decision, Trace
@@ -32,7 +32,12 @@ def decisions(name: str) -> dict[str, int]:
             if sensor["events"]:
                 sensor["events"]["_half_loop_ns"] += BEHIND_NS
     begin = given._begin_anew
-    with mock.patch.object(given, "_begin_anew", lambda *known: made.append(begin(*known)) or made[-1]):
+
+    def begun(*known: Any) -> Clocks:
+        made.append(begin(*known))
+        return made[-1]
+
+    with mock.patch.object(given, "_begin_anew", begun):
         steps, known = [], [0.0] * len(KNOWN)
         for step in given.replay(anew=True):
             steps.append(step)
