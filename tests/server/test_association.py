@@ -256,7 +256,7 @@ def test_how_late_it_is_read_depends_on_what_an_early_poll_costs(
     assert best_margin_ns(cost, deviation) == pytest.approx(margin, abs=1e-3)
 
 
-def local_clock(exchanges: int = 300) -> tuple[LocalClock, Callable[[int, int], None]]:
+def local_clock(exchanges: int = 300) -> tuple[LocalClock, Callable[..., None]]:
     """One that goes like this computer's; and an exchange in which it was off by so much."""
     bus, now_ns = RoundTrip(), 10**9
     bus.learn_shortest(0, 100_000)
