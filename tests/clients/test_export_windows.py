@@ -111,6 +111,35 @@ def test_a_lost_sample_stays_in_its_place_and_is_masked(tmp_path: Path) -> None:
     assert made["acceleration_valid"][1].tolist() == [False, True, False, True, True, True, True, True]
 
 
+@pytest.mark.parametrize(
+    ("of", "valid"),
+    [
+        ({}, (True, True, True)),
+        ({"force_torque_saturated": 1}, (False, True, True)),
+        ({"acceleration_saturated": 2}, (True, False, True)),
+        ({"angular_rate_saturated": 4}, (True, True, False)),
+        ({"force.z": math.inf}, (False, True, True)),
+        ({"angular_rate.z": math.nan}, (True, True, False)),
+        ({"imu_active": 0}, (True, False, False)),
+        ({"imu_active": 1}, (True, True, True)),
+    ],
+)
+def test_each_channel_is_valid_by_itself(of: dict[str, Any], valid: tuple[bool, ...]) -> None:
+    made, of = Windows(2), dict(of)
+    switched = {"imu_active": of.pop("imu_active")} if "imu_active" in of else {}
+    made.configure(InForce(SensorInfo(settings=SETTINGS | switched, rate_hz=RATE_HZ)))
+    made.add(columns([frame(0, **{"force.y": 2.0, "acceleration.y": 1.0, "angular_rate.x": 180.0, **of})]))
+    found = made.at(np.array([made.until_ns]))
+    names = ("force_torque", "acceleration", "angular_rate")
+    assert tuple(bool(found[f"{name}_valid"][0, 1]) for name in names) == valid
+    expected = [0, 2, 0, 0, 0, 0, 0, 9.80665, 0, math.pi, 0, 0]
+    places = np.repeat(valid, [6, 3, 3])
+    six = np.concatenate([found["force_torque"][0, 1], found["imu"][0, 1]])
+    assert np.isnan(six).tolist() == (~places).tolist()
+    assert six[places] == pytest.approx(np.array(expected)[places])
+    assert not any(found[f"{name}_valid"][0, 0] for name in names), "there was none before"
+
+
 @pytest.mark.parametrize("step_s", [-0.3, 0.3, -3600.0])
 def test_a_step_of_the_wall_clock_in_the_middle_bends_nothing(tmp_path: Path, step_s: float) -> None:
     def stamp(instant: float) -> int:

@@ -212,6 +212,17 @@ def test_a_monitor_that_was_not_run_blames_neither_server_nor_sensor(model: Mode
     assert alert.remedy == "Give it a priority, or the computer less to do"
 
 
+@pytest.mark.parametrize(
+    ("unread_s", "why"),
+    [(0.49, "the server sends none"), (0.5, "this computer did not run this program for 500 ms")],
+)
+def test_a_short_time_unread_is_no_reason_for_silence(model: Model, unread_s: float, why: str) -> None:
+    take(model, *run(0, 10))
+    model.note_unread(unread_s, False, now(9) + 0.9)
+    model.add_status(status(), now(9) + 0.9)
+    assert texts(only(model, now(9) + 0.9)) == [f"No new sample for 0.9 s, {why}"]
+
+
 def test_what_is_past_is_told_at_its_worst_and_at_its_last_time(model: Model) -> None:
     at = 0
     for lost in (0, 40, 7):  # then more than a second in which none is

@@ -6,7 +6,7 @@ import functools
 import itertools
 import random
 import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,16 +15,19 @@ import pytest
 
 from bota_clients.export.cli import main as export
 from bota_clients.identify.cli import main as identify
-from bota_clients.recording.order import longest_order
+from bota_clients.recording.columns import columns
+from bota_clients.recording.order import TimeAxis, longest_order
 from bota_clients.report.checks import Examination
 from bota_clients.report.cli import main as report
 from bota_clients.report.series import of_recording
-from bota_ethercat.framing import DataMessage
+from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import ImuUnits
+from bota_ethercat.replies import SensorInfo
 from bota_ethercat.settings import start_up_defaults
+from bota_ethercat.stream.timeline import InForce
 from bota_ft_compensation.quantities import Payload
 from tests.clients.bags import imu, write_bag
-from tests.clients.recordings import START_NS, describe, write
+from tests.clients.recordings import START_NS, describe, frame, write
 from tests.clients.test_identify import felt_frames
 from tests.compensation import motion
 from tests.ended import Result, run_here
@@ -226,3 +229,42 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path, program: Callable[
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.1 * peaks[0]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "wall", "places", "restarts"),
+    [
+        pytest.param((5, 6, 7, 8), (0, 1, 2, 3), (5, 6, 7, 8), 0, id="in order"),
+        pytest.param((5, 9, 2, 3, 4), (0, 4, 7, 8, 9), (5, 9, 12, 13, 14), 1, id="restarted"),
+        pytest.param((5, 9, 2, 3), (0, 4, 4, 5), (5, 9, 10, 11), 1, id="a second has passed at least"),
+        pytest.param((5, 9, 2, 3), (0, 4, -7, -6), (5, 9, 10, 11), 1, id="whatever the wall clock says"),
+        pytest.param((5, 9, 2, 9, 10), (0, 4, 7, 8, 9), (5, 9, 12, 19, 20), 1, id="not after it: no stray"),
+        pytest.param((5, 9, 2, 10, 11), (0, 4, 4, 5, 6), (5, 9, 10, 10, 11), 0, id="it was a stray"),
+        pytest.param((5, 9, 2, 1, 2), (0, 4, 6, 7, 8), (5, 9, 11, 10, 11), 1, id="once only"),
+        pytest.param((5, 99, 6, 7), (0, 1, 2, 3), (5, 99, 6, 7), 0, id="one too late is no restart"),
+        pytest.param((5, 99, 5, 6), (0, 1, 9, 10), (5, 99, 107, 108), 1, id="unless it falls to before it"),
+        pytest.param((5, 6, 5, 6), (0, 1, 2, 3), (5, 6, 5, 6), 0, id="a second is none"),
+        pytest.param((5, 9, 1, 8, 0, 1), (0, 4, 5, 12, 14, 15), (5, 9, 10, 17, 19, 20), 2, id="twice"),
+    ],
+)
+def test_where_frames_are_on_the_axis_however_they_come(
+    seconds: Sequence[int], wall: Sequence[int], places: Sequence[int], restarts: int
+) -> None:
+    times, stamps = np.array(seconds) * SECOND, np.array(wall) * SECOND
+    for cuts in itertools.product((False, True), repeat=len(times) - 1):
+        axis, edges = TimeAxis(), [0, *np.flatnonzero(cuts) + 1, len(times)]
+        parts = [slice(*edge) for edge in itertools.pairwise([0, *edges])]
+        found = np.concatenate([axis.places(times[part], stamps[part]) for part in parts])
+        assert (found / SECOND).tolist() == list(places), cuts
+        assert axis.restarts == restarts
+
+
+def test_a_recording_in_parts_has_the_samples_that_are_later_than_all_before() -> None:
+    """Of three batches: REPEATED frames are kept and are none."""
+    axis, kept = TimeAxis(), list[list[int]]()
+    for numbers in ((1, 2, 9), (8, 10, 10, 12, 11, 13), (5, 6), (13, 14)):
+        made = columns([frame(each, flags=DataFlag.REPEATED * (each == 2)) for each in numbers])
+        kept += [batch.sequence.tolist() for _, batch in axis.batches([(InForce(SensorInfo()), made)])]
+    assert kept == [[1, 2, 9], [10, 11, 13], [14]]
+    assert (axis.left_out, axis.restarts) == (6, 0)
+    assert axis.said == ["6 samples out of order left out"]

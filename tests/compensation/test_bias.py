@@ -13,9 +13,13 @@ import numpy as np
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
+from bota_ethercat.replies import SensorInfo
 from bota_ethercat.sensor.rest import StationaryLimits
 from bota_ethercat.sensor.warnings_register import WarningFlag
+from bota_ethercat.stream.timeline import InForce
 from bota_ft_compensation.bias import BiasRamp, TareBasis, check_at_rest, estimate_bias
+from bota_ft_compensation.imu import IMU_IS_OFF, ImuSource, Source, imu_position
+from bota_ft_compensation.own_offset import OwnOffset
 from bota_ft_compensation.quantities import (
     NO_PAYLOAD,
     NO_WRENCH,
@@ -30,7 +34,7 @@ from bota_ft_compensation.stationary import (
     StationaryWindow,
     stationary_means,
 )
-from bota_ft_compensation.stream import obstacle
+from bota_ft_compensation.stream import CompensatedStream, Plan, obstacle
 from tests.compensation.making import AXES, BIAS, TOOL, gravity_for, load, noisy, sample
 
 RATE = 800
@@ -236,14 +240,27 @@ def test_a_shift_and_another_tool_change_both_biases() -> None:
     assert BiasRamp().go(NEW, 0.0).shifted(NEW).undone(1.0).target == NO_WRENCH, "none stays none"
 
 
+COUNTS = "settings.calibration_matrix is off, so force and torque are counts and not N and Nm: switch it on"
+ITSELF = (
+    "settings.inertia_compensation is on, so the sensor takes gravity off itself: switch it off, or set "
+    "tool_mass to 0"
+)
+TURNED = (
+    "settings.coordinate_system is on, so the wrench is in a frame configured in the sensor, and the "
+    "rotation from the IMU to it is unknown: switch it off, or take the orientation of that frame from the "
+    "robot (gravity_source)"
+)
+
+
 @pytest.mark.parametrize(
     ("settings", "without_tool", "by_robot", "by_imu"),
     [
         ({}, "", "", ""),
-        ({"calibration_matrix": False}, *["calibration_matrix is off"] * 3),
-        ({"inertia_compensation": True}, "", *["inertia_compensation is on"] * 2),
-        ({"coordinate_system": True}, "", "", "coordinate_system is on"),
-        ({"imu_active": 0}, "", "", "imu_active"),
+        ({"calibration_matrix": False}, COUNTS, COUNTS, COUNTS),
+        ({"inertia_compensation": True}, "", ITSELF, ITSELF),
+        ({"coordinate_system": True}, "", "", TURNED),
+        ({"imu_active": 0}, "", "", IMU_IS_OFF),
+        ({"imu_active": 1, "calibration_matrix": True, "inertia_compensation": False}, "", "", ""),
     ],
 )
 def test_the_settings_with_which_nothing_can_be_compensated(
@@ -253,6 +270,112 @@ def test_the_settings_with_which_nothing_can_be_compensated(
         (without_tool, False, False), (without_tool, False, True), (by_robot, True, False),
         (by_imu, True, True),
     ):  # fmt: skip
-        told = obstacle(settings, has_tool=has_tool, by_imu=is_imu)
-        assert expected in told
-        assert bool(told) == bool(expected)
+        assert obstacle(settings, has_tool=has_tool, by_imu=is_imu) == expected
+
+
+# What holds up single samples.
+
+BEING_CHANGED = "the sensor's own offset was being changed"
+UNKNOWN = "the sensor's own offset is being changed, or is no longer known: if this lasts, tare"
+APPEARED = "the sensor's own offset was unknown when the bias was taken: the bias may be wrong, tare"
+
+
+def test_a_bias_goes_with_the_sensors_own_offset_as_long_as_that_is_known() -> None:
+    own = OwnOffset()
+    assert (own.follow(None), own.follow(OLD), own.doubt(None)) == (None, None, UNKNOWN)
+    assert own.follow(NEW) == NO_WRENCH, "there is no bias to shift"
+    own.begin(BIAS, OLD)
+    assert (own.follow(OLD), own.doubt(OLD)) == (None, "")
+    assert own.follow(NEW) == NEW
+    assert (own.follow(NEW), own.doubt(NEW)) == (None, ""), "once"
+    assert own.follow(None) is None
+    assert own.follow(OLD) == NO_WRENCH.plus(NEW, -1.0)
+    own.begin(NO_WRENCH, None)
+    assert own.follow(OLD) is None
+    assert own.doubt(OLD) == "", "what is no bias cannot be wrong"
+    own.begin(NO_WRENCH, None, is_measured=True)
+    assert own.follow(OLD) is None
+    assert own.doubt(OLD) == own.doubt(None) == APPEARED
+    own.begin(NO_WRENCH, OLD, is_measured=True)
+    assert own.follow(NEW) == NEW
+    assert own.doubt(NEW) == ""
+
+
+def test_why_a_sample_may_not_be_used() -> None:
+    stream = CompensatedStream(Plan(ImuSource(), TOOL))
+    stream.feel(sample(), 1.0, 0.0)
+    hot, saturated = sample(warnings=WarningFlag.OVERTEMPERATURE), sample(angular_rate_saturated=1)
+    broken = sample(warnings=WarningFlag.ADC_OUT_OF_SYNC)
+    faulty = "force or torque was not finite, or of a sensor that reports a fault"
+    for use_saturated, told in (
+        (True, ""), (False, "angular rate was saturated or out of range, and on_saturation is stop"),
+    ):  # fmt: skip
+        stream.use_saturated = use_saturated
+        assert [stream.why_not(each) for each in (sample(), hot, saturated)] == ["", "", told]
+        assert stream.why_not(broken) == faulty
+    stream.plan = Plan(payload=TOOL)
+    assert stream.why_not(saturated) == "", "the IMU is not needed"
+    stream.forbidden = "for a reason"
+    stream.check()
+    assert stream.why_not(sample()) == "for a reason"
+
+
+def test_after_a_change_of_its_own_offset_the_samples_on_their_way_are_in_doubt() -> None:
+    """Two filters' lengths of a sample after the newest; the source has none of its own."""
+    stream = CompensatedStream(Plan(ramp=BiasRamp(BIAS)))
+
+    def told(offset: Wrench | None) -> Wrench | None:
+        six = None if offset is None else offset.values
+        stream.configure(InForce(SensorInfo(rate_hz=800.0, settings={"sinc_length": 64}, offset=six)))
+        return stream.follow_offset()
+
+    stream.own_offset.begin(BIAS, OLD)
+    assert told(OLD) is None
+    assert stream.feel(sample(), 10.0, 0.0) == ZERO
+    assert stream.why_not(sample()) == ""
+    assert told(NEW) == NEW
+    assert stream.plan.ramp.target == BIAS.plus(NEW)
+    after_s = stream.in_force.doubt_after_ns * 1e-9
+    assert after_s > 1.25e-3
+    for time_s, why in ((10.0, BEING_CHANGED), (10.0 + after_s, BEING_CHANGED), (10.0 + after_s + 1e-4, "")):
+        stream.feel(sample(), time_s, 0.0)
+        assert stream.why_not(sample()) == why
+    assert told(None) is None
+    assert stream.why_not(sample()) == stream.hold == UNKNOWN
+    assert told(NEW) is None
+    assert stream.why_not(sample()) == ""
+    assert stream.feel(sample(), 20.0, 0.0, always=True) is None, "there is no source"
+
+
+def test_where_the_sensors_own_imu_is() -> None:
+    assert imu_position("BFT-SENS-ECAT-M8") == (0.0, 0.0, 0.0093 - 0.035)
+    assert imu_position("BFT-LAXS-ECAT") == (0.0, 0.0, 0.01195 - 0.0445)
+    assert imu_position("unheard of") == ZERO
+    assert imu_position("BFT-SENS-ECAT-M8", (0.0, 0.01, 0.0)) == (0.0, 0.01, 0.0)
+    source = ImuSource((0.01, 0.02, 0.03), (0.1, 0.2, 0.3))
+    assert source.lever_of("BFT-SENS-ECAT-M8") == pytest.approx((-0.09, -0.18, -0.27))
+    before = source.alignment
+    source.configure(InForce(SensorInfo(name="BFT-SENS-ECAT-M8")))
+    assert source.alignment is before, "settings and rate are the same"
+    for settings, rate_hz in (({"sinc_length": 64}, None), ({"sinc_length": 64}, 800.0)):
+        source.configure(InForce(SensorInfo(rate_hz=rate_hz or 0.0, settings=settings)))
+        assert source.alignment is not before
+        before = source.alignment
+
+
+def test_why_there_is_no_specific_force() -> None:
+    source, none = ImuSource(), Source("nobody tells")
+    off, fast = sample(acceleration=ZERO), sample(acceleration=(math.nan, 0.0, 9.8))
+    assert (source.why_none(sample(), 0.0), source.why_none(off, 0.0)) == ("", IMU_IS_OFF)
+    assert source.why_none(fast, 0.0) == "the IMU sends NaN or infinity: see the status stream"
+    assert source.specific_force(sample(), 1.0, 0.0) == source.felt
+    felt_before = source.felt
+    assert source.specific_force(off, 1.01, 0.0) is None
+    assert source.felt == felt_before, "of the latest sample in which something was felt"
+    assert none.why_none(sample(), 0.0) == (
+        "nobody tells, so the weight of the tool is not known: set gravity_source to a source, or set "
+        "tool_mass to 0"
+    )
+    assert none.specific_force(sample(), 1.0, 0.0) is None
+    assert (none.age_s(1.0), source.age_s(1.0)) == (math.inf, math.inf)
+    assert (none.is_imu, source.is_imu, none.name, source.name) == (False, True, "none", "imu")

@@ -12,7 +12,7 @@ from bota_ft_compensation.alignment import align
 from bota_ft_compensation.identification.free_motion import identify_in_motion
 from bota_ft_compensation.identification.inertia import turn
 from bota_ft_compensation.identification.payload import Identified
-from bota_ft_compensation.quantities import EXACT, CompensationError
+from bota_ft_compensation.quantities import EXACT, CompensationError, likely_inertia
 from tests.compensation import motion
 from tests.compensation.making import BIAS, SEED, check_coverage
 from tests.compensation.motion import IMU, Felt, imperfect, settings, tool_of
@@ -114,6 +114,9 @@ def test_a_touch_is_left_out_and_hardly_any_motion_is_refused() -> None:
     found = identified(recorded("about x", SEED + 6, tool))
     assert found.payload.mass == pytest.approx(tool.mass, abs=1.5 * found.mass_interval)
     assert "hardly turned about y and z" in found.notes[0]
+    xx, *unseen = found.payload.inertia[:3]
+    assert xx == pytest.approx(tool.inertia[0], abs=found.payload.inertia_interval[0])
+    assert unseen == pytest.approx(likely_inertia(found.payload)[0][1:3], rel=0.01)
 
 
 @pytest.mark.parametrize("times", [1.0, 12.0])

@@ -1,8 +1,11 @@
-"""Which sample an exchange brought, by a table; every change of what event times are worth is in another."""
+"""Which sample an exchange brought, what event times are worth, and what round trips tell: by tables."""
 
 from __future__ import annotations
 
 import itertools
+import math
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -15,6 +18,9 @@ from ethercat_server.sampling.association import (
     associate_by_polls,
     count_steps,
 )
+from ethercat_server.sampling.round_trip import RoundTrip
+from ethercat_server.sampling.schedule import best_margin_ns
+from ethercat_server.sampling.slave_clock import LocalClock
 from ethercat_server.sampling.trust import TRANSITIONS, Evidence, Trust, TrustState
 
 PERIOD_NS, LEAST_NS = 1_000_000, 50_000
@@ -93,3 +99,206 @@ def test_what_event_times_are_worth_changes_by_the_table_only(state: TrustState,
         with pytest.raises(KeyError):
             trust._enter(evidence)
         assert trust.state is state
+
+
+MS, MINUTE = 10**6, 60 * 10**9
+
+
+def tried(
+    now_ns: int, count: int = 99, unfit: int = 1, difference_ns: float = 0.0, trust: Trust | None = None
+) -> Trust:
+    """After a trial that ends then, with so many events that fit, and that do not."""
+    trust = trust or Trust()
+    trust.judge(1.0, now_ns - 500 * MS, 0)
+    for number in range(count + unfit):
+        trust.compare(difference_ns if number < count else None, is_new=True, counts=True)
+    trust.judge(1e6, now_ns, 0)
+    return trust
+
+
+@pytest.mark.parametrize(
+    ("made", "state", "why"),
+    [
+        ({}, TrustState.TRUSTED, ""),
+        ({"count": 98}, TrustState.TRIAL, ""),
+        ({"count": 98, "unfit": 2}, TrustState.TRIAL, "they contradict the frames"),
+        ({"difference_ns": 3000.0}, TrustState.TRUSTED, ""),
+        (
+            {"difference_ns": -3001.0},
+            TrustState.TRIAL,
+            "they differ from what polling shows by -3 µs",
+        ),
+    ],
+)
+def test_a_trial_is_of_so_many_events_that_fit_so_well(
+    made: dict[str, Any], state: TrustState, why: str
+) -> None:
+    trust = tried(1000 * MS, **made)
+    assert (trust.state, trust.why) == (state, why)
+
+
+def test_a_trial_takes_its_time_and_needs_events_that_move() -> None:
+    trust = Trust()
+    for number in range(200):
+        trust.compare(2.0, is_new=True, counts=True)
+        found = trust.judge(1e6, 1000 * MS + number * 4 * MS, 0)
+        assert bool(found) == trust.is_trusted == (number == 125), "the time before the first does not count"
+        if found:
+            assert found == 4.0
+            break
+    still = Trust()
+    still.judge(1e6, 1, 0)
+    for _ in range(100):
+        still.compare(None, is_new=False, counts=True)
+    assert still.judge(1e6, 500 * MS + 1, 4) == 0.0
+    assert (still.state, still.why) == (TrustState.ABSENT, "they stand still")
+    for restarts, state in ((4, TrustState.TRIAL), (5, TrustState.ABSENT)):
+        jumps = Trust()
+        jumps.judge(1e6, 1, 7)
+        jumps.judge(1e6, 500 * MS + 1, 7 + restarts)
+        assert jumps.state is state
+    assert jumps.why == "its local clock does not run"
+
+
+def test_contradictions_end_trust_and_each_trial_that_fails_doubles_the_pause() -> None:
+    trust, now_ns = tried(1000 * MS), 1000 * MS
+    for failure in range(1, 6):
+        for number in range(5):
+            assert trust.is_trusted
+            assert trust.is_steady == (number == 0)
+            trust.contradict(now_ns, 0)
+        if failure < 5:
+            tried(now_ns := now_ns + 1000 * MS, trust=trust)
+    for pause_s in (10, 20, 40, 80, 160, 320, 320):
+        assert (trust.state, trust.is_steady) == (TrustState.REFUSED, False)
+        assert not trust.is_due(now_ns + pause_s * 1000 * MS - 1)
+        now_ns += pause_s * 1000 * MS
+        assert trust.is_due(now_ns)
+        trust.retry()
+        assert not trust.is_due(now_ns)
+        tried(now_ns := now_ns + 1000 * MS, unfit=2, trust=trust)
+
+
+@pytest.mark.parametrize(("trusted_ns", "failures"), [(MINUTE, 1), (MINUTE + 1, 5)])
+def test_what_was_trusted_for_long_has_no_failures_behind_it(trusted_ns: int, failures: int) -> None:
+    trust, now_ns = Trust(), 0
+    for _ in range(4):
+        tried(now_ns := now_ns + 1000 * MS, unfit=2, trust=trust)
+    for _ in range(failures):
+        assert trust.state is TrustState.TRIAL
+        tried(now_ns := now_ns + 1000 * MS, trust=trust)
+        now_ns += trusted_ns if not trust.contradictions else 0
+        trusted_ns = 0
+        for _ in range(5):
+            trust.contradict(now_ns, 0)
+    assert trust.state is TrustState.REFUSED
+
+
+def test_a_contradiction_is_outweighed_by_a_hundred_samples() -> None:
+    trust = tried(1000 * MS)
+    for _ in range(4):
+        trust.contradict(1000 * MS, 0)
+    for _ in range(400):
+        assert not trust.is_steady
+        trust.confirm()
+    trust.confirm()
+    assert trust.is_steady
+    for _ in range(100):
+        trust.confirm()
+    for _ in range(4):
+        trust.contradict(1000 * MS, 0)
+    assert trust.is_trusted, "more than none is no credit"
+    trust.contradict(1000 * MS, 0)
+    assert not trust.is_trusted
+
+
+def test_what_round_trips_tell() -> None:
+    bus = RoundTrip(10_000)
+    assert bus.as_json() == {"least_us": None, "usual_us": None}
+    bus.learn(0, 50_000, 60_000, 1000.0)
+    assert bus.as_json() == {"least_us": 60.0, "usual_us": 79.7}
+    assert (bus.excess_ns, bus.taking_over_ns, bus.late_ns) == (19_687.5, 156.25, 15.625)
+    assert bus.patience_ns == 79_687.5 + 3 * 19_687.5 + 100_000
+    assert bus.read_instant(100, 50_100) == (100, 0.0)
+    assert bus.read_instant(100, 50_112) == (106.0, 12.0)
+    stalled = RoundTrip()
+    stalled.learn(0, 50_000, 50_000)
+    before = stalled.excess_ns
+    stalled.learn(10**6, 10**6 + 10**9, 2 * 10**9, 10.0**9)
+    assert 0 < stalled.excess_ns - before < 2000, "a stall is no jitter"
+    assert stalled.taking_over_ns == 20_000 / 64
+    assert stalled.late_ns == 80_000 / 64
+
+
+@pytest.mark.parametrize(
+    ("first_us", "then_us", "moved_us"),
+    [(50, 200, -10.0), (50, 55, 0.0), (200, 50, 75.0), (200, 181, 0.0), (200, 180, 10.0)],
+)
+def test_the_shortest_round_trip_is_a_recent_one(first_us: int, then_us: int, moved_us: float) -> None:
+    """Where it changes by more than jitter all phases have another origin."""
+    bus, window_ns = RoundTrip(), 2_000_000_000
+    bus.learn_shortest(0, first_us * 1000)
+    for number in range(1, 5):
+        sent_ns = number * window_ns // 2
+        bus.learn_shortest(sent_ns, sent_ns + then_us * 1000)
+        is_known = then_us < first_us or number >= 4
+        assert bus.least_ns == (then_us if is_known else first_us) * 1000
+        assert bus.moved_ns == (moved_us * 1000 if is_known else 0.0)
+    assert bus.excess_ns == 20_000 + 2 * bus.moved_ns
+
+
+@pytest.mark.parametrize(
+    ("cost", "deviation", "margin"), [(100, 10, 16.635), (25, 10, 0.0), (26, 10, 2.7045)]
+)
+def test_how_late_it_is_read_depends_on_what_an_early_poll_costs(
+    cost: float, deviation: float, margin: float
+) -> None:
+    assert best_margin_ns(cost, deviation) == pytest.approx(margin, abs=1e-3)
+
+
+def local_clock(exchanges: int = 300) -> tuple[LocalClock, Callable[..., None]]:
+    """One that goes like this computer's; and an exchange in which it was off by so much."""
+    bus, now_ns = RoundTrip(), 10**9
+    bus.learn_shortest(0, 100_000)
+    clock = LocalClock(bus)
+
+    def exchange(off_ns: int = 0, took_ns: int = 100_000) -> None:
+        nonlocal now_ns
+        now_ns += 10**6
+        clock.local, clock.back_ns = now_ns + 50_000 + off_ns, now_ns + took_ns
+        clock.learn(now_ns, now_ns + took_ns, 1)
+
+    for number in range(exchanges):
+        assert clock.is_known is (number >= 4 + 8 + 12 + 16 + 20 + 24 + 28 + 5 * 32)
+        exchange()
+    return clock, exchange
+
+
+@pytest.mark.parametrize(
+    ("off_us", "moved_us"),
+    [(0, 0), (-49, 0), (49, 0), (-55, 5), (55, -5), (-99, 49), (99, -49), (-101, 0), (101, 0)],
+)
+def test_a_local_time_is_within_the_exchange_that_read_it(off_us: int, moved_us: int) -> None:
+    """What is less beyond than half of an exchange moves all instants; what is more has jumped."""
+    clock, exchange = local_clock()
+    exchange(off_us * 1000, 100_000)
+    assert clock.moved_ns == pytest.approx(moved_us * 1000, abs=1)
+    assert clock.phase.phase_ns == pytest.approx(clock.local_at + clock.moved_ns, abs=1)
+
+
+def test_a_local_clock_that_jumped_is_known_anew_by_the_third_block() -> None:
+    clock, exchange = local_clock(304)
+    for number in range(3 * 32):
+        assert (clock.restarts, clock.is_known) == (0, True), number
+        exchange(10**8)
+    assert (clock.restarts, clock.is_known, clock.excess_ns) == (1, False, 0.0)
+
+
+def test_an_exchange_is_short_by_the_best_of_its_block() -> None:
+    clock, exchange = local_clock()
+    assert clock.short_ns == 100_000
+    for _ in range(64):
+        exchange(20_000, 140_000)
+    assert clock.short_ns == 140_000
+    assert 0 < clock.excess_ns < 20_000
+    assert clock.doubt_ns == pytest.approx(5 * math.sqrt(clock.phase.variance))

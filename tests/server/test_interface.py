@@ -422,20 +422,97 @@ def test_an_address_that_somebody_gave_it_is_allowed(veth: Veth) -> None:
         assert "not for a sensor: 192.0.2.77/32" not in listed
 
 
+OTHER = "name the sensor's interface ('ethercat-sensor adapters' lists them)"
+
+
 @pytest.mark.parametrize(
-    ("routes", "why"),
+    ("routes", "why", "said"),
     [
-        (Routes(("10.0.0.2/24",), (), True), "default route"),
-        (Routes(leased=("2001:db8::2/64",)), "address 2001:db8::2/64 by DHCP"),
-        (Routes(("10.0.0.2/24",)), None),
-        (Routes((), ("fe80::1/64",), others=("10.1.0.0/16",)), None),
-        (Routes(others=("10.1.0.0/16",), beyond=("10.1.0.0/16",)), "the route to 10.1.0.0/16, through"),
-        (Routes(), None),
+        (
+            Routes(("10.0.0.2/24",), (), True, beyond=("10.9.0.0/16",)),
+            f"ens5 has the machine's default route, so it is not for a sensor: {OTHER}; --allow-ip overrides "
+            "this",
+            "default route, route to 10.9.0.0/16, 10.0.0.2/24",
+        ),
+        (
+            Routes(leased=("2001:db8::2/64", "10.0.0.2/24")),
+            f"ens5 has the IP address 2001:db8::2/64 by DHCP, so it is part of a network: {OTHER}, or, if "
+            "only the sensor is on it, 'sudo ip address flush dev ens5'; --allow-ip overrides this",
+            "",
+        ),
+        (Routes(("10.0.0.2/24",)), None, "10.0.0.2/24"),
+        (Routes((), ("fe80::1/64",), others=("10.1.0.0/16",)), None, ""),
+        (
+            Routes(others=("10.1.0.0/16",), beyond=("10.1.0.0/16", "10.2.0.0/16"), leased=("10.1.0.2/24",)),
+            f"ens5 has the route to 10.1.0.0/16, through a gateway, so it is not for a sensor: {OTHER}; "
+            "--allow-ip overrides this",
+            "route to 10.1.0.0/16, route to 10.2.0.0/16",
+        ),
+        (Routes(), None, ""),
     ],
 )
-def test_what_every_interface_may_have_is_no_network(routes: Routes, why: str | None) -> None:
-    problem = network_trouble("ens5", routes)
-    assert problem is None if why is None else problem is not None and why in problem
+def test_what_every_interface_may_have_is_no_network(routes: Routes, why: str | None, said: str) -> None:
+    assert (network_trouble("ens5", routes), str(routes)) == (why, said)
+
+
+@pytest.mark.parametrize(
+    ("family", "length", "address", "found"),
+    [
+        (socket.AF_INET, 0, "", ""),
+        (socket.AF_INET, 7, "10.0.0.0", ""),
+        (socket.AF_INET, 8, "10.0.0.0", "10.0.0.0/8"),
+        (socket.AF_INET, 4, "224.0.0.0", "224.0.0.0/4"),
+        (socket.AF_INET6, 6, "fc00::", ""),
+        (socket.AF_INET6, 7, "fc00::", "fc00::/7"),
+    ],
+)
+def test_a_destination_of_many_networks_is_that_of_a_default_route(
+    family: int, length: int, address: str, found: str
+) -> None:
+    told = {1: socket.inet_pton(family, address)} if address else {}
+    assert nic._destination(family, length, told) == found
+
+
+def test_what_a_name_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nic, "own_name", lambda name: {"alternative/name": "ens5"}.get(name, name))
+    for name, is_one in (
+        ("a" * 15, True), ("a" * 16, False), ("\N{MICRO SIGN}" * 8, False), ("", False), ("a/b", False),
+        ("alternative/name", True),
+    ):  # fmt: skip
+        told = (
+            f"{name!r} is not an interface name: it must have 1 to 15 characters; "
+            "'ethercat-sensor adapters' lists them"
+        )
+        assert nic.name_trouble(name) == (None if is_one else told)
+
+
+@pytest.mark.parametrize(
+    ("answer", "found"),
+    [
+        ((100, 1, 0), (100, 1)),
+        ((0x86A0, 0, 1), (100_000, 0)),
+        ((0xFFFF, 255, 0xFFFF), (0, 255)),
+        ((0xFFFF, 1, 0), (0, 1)),
+        ((0, 1, 0), (0, 1)),
+    ],
+)
+def test_the_speed_of_a_link(
+    answer: tuple[int, ...], found: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(nic, "ethtool", lambda *_: answer)
+    assert nic.link_settings("ens5") == found
+
+
+BOTH = ["CAP_NET_ADMIN", "CAP_NET_RAW"]
+
+
+@pytest.mark.parametrize(
+    ("mask", "missing"), [(0x3000, []), (0x1000, BOTH[1:]), (0x2000, BOTH[:1]), (0xCFFF, BOTH)]
+)
+def test_what_must_be_allowed(mask: int, missing: list[str]) -> None:
+    told = f"Name:\tx\nCapInh:\t0\nCapEff:\t{mask:016x}\nCapBnd:\t0\n"
+    assert nic.missing_capabilities(told) == missing
+    assert nic.missing_capabilities("Name:\tx\n") == BOTH
 
 
 # -- who has it

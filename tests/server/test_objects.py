@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import logging
 import random
 import struct
 from collections.abc import Iterator
@@ -23,7 +24,7 @@ from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.datagrams import Steps, T, finish
 from ethercat_server.ethercat.slave.al import AlStatus
-from ethercat_server.ethercat.slave.coe import MailboxSdo
+from ethercat_server.ethercat.slave.coe import Emergencies, Emergency, MailboxSdo
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sensor.objects.access import write
 from ethercat_server.sensor.objects.dictionary import (
@@ -488,3 +489,64 @@ def test_a_sensor_that_turns_fast_is_not_at_rest_however_steadily() -> None:
         run_tare(ScriptedSdo(), 100, [0.0] * 6, itertools.repeat(1.0), rate_dps=30.0)
     tared = run_tare(ScriptedSdo(), 100, [0.0] * 6, itertools.repeat(1.0), rate_dps=20.0)
     assert tared["residual"] == [0.0] * 6
+
+
+# -- emergencies
+
+
+def test_emergencies_are_told_at_a_bounded_rate_and_all_are_counted(caplog: pytest.LogCaptureFixture) -> None:
+    """Five at once and one a second; the same one again after ten seconds; each sensor for itself."""
+    caplog.set_level(logging.INFO)
+    clock, told = ManualClock(), list[tuple[int, int, int]]()
+    known = Emergencies(clock)
+    known.note(0, Emergency(0x4210, 0, b""))
+    assert known.status(1) == {"emergencies": 0, "emergency": None}
+    known.tell = lambda number, emergency, count: told.append((number, emergency.code, count))
+
+    def note(*codes: int, number: int = 1) -> list[tuple[int, int, int]]:
+        told.clear()
+        for code in codes:
+            known.note(number, Emergency(code, 0x81, b"\1\2"))
+        return told
+
+    assert note(0x4210, 0x4210, 0x12) == [(1, 0x4210, 1), (1, 0x12, 3)]
+    assert [record.levelname for record in caplog.records] == ["WARNING", "WARNING", "INFO"]
+    assert caplog.messages[-2] == (
+        "sensor 1 reports emergency 0x4210 (temperature), error register 0x81, data 0102"
+    )
+    assert [code for _, code, _ in note(*range(0x5001, 0x5007))] == [0x5001, 0x5002, 0x5003]
+    assert note(0x4210, number=2) == [(2, 0x4210, 1)]
+    clock.sleep(0.999)
+    assert note(0x5010) == []
+    clock.sleep(0.001)
+    assert note(0x5011, 0x5012) == [(1, 0x5011, 11)]
+    clock.sleep(9.999)
+    assert note(0x5011) == []
+    clock.sleep(0.001)
+    assert note(0x5011) == [(1, 0x5011, 14)]
+    clock.sleep(100.0)
+    assert len(note(*range(0x6000, 0x6009))) == 5
+    clock.sleep(1.2344)
+    last = {"code": 0x6008, "text": "software of the device", "register": 0x81, "data": "0102"}
+    assert known.status(1) == {"emergencies": 23, "emergency": {**last, "ago_s": 1.234}}
+
+
+@pytest.mark.parametrize(
+    ("areas", "is_refused"),
+    [
+        (((0x1000, 128), (0x1080, 128)), False),
+        (((0x1000, 0), (0x1080, 0)), False),
+        (((0x1000, 16), (0x1080, 1486)), False),
+        (((0x1000, 15), (0x1080, 128)), True),
+        (((0x1000, 128), (0x1080, 1487)), True),
+    ],
+)
+def test_mailboxes_that_no_frame_can_carry(areas: Any, is_refused: bool) -> None:
+    with contextlib.nullcontext() if not is_refused else pytest.raises(BusError) as error:
+        MailboxSdo(cast(Bus, GivenBus()), 3, areas)
+    if is_refused:
+        assert error is not None
+        assert str(error.value) == (
+            f"sensor 3 has mailboxes of {areas[0][1]} and {areas[1][1]} bytes, which no frame can carry: "
+            "power it off and on"
+        )

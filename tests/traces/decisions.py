@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+from unittest import mock
 
-from ethercat_server.sampling.replay import Trace
-from ethercat_server.sampling.trace import RecordKind
+from ethercat_server.sampling.replay import Decision, Trace
+from ethercat_server.sampling.trace import Clocks, RecordKind
 
 FOLDER: Final = Path(__file__).parent
+BEHIND_NS: Final = 100.0  # as if another slave were behind
 NAMES: Final = ("quiet", "loops", "slow", "stalls", "lies", "unplugged")
 DECISIONS: Final = FOLDER / "decisions.json"
 
@@ -21,8 +25,24 @@ def trace(name: str) -> Trace:
 
 
 def decisions(name: str) -> dict[str, int]:
-    """Counts of samples and exchanges; ages of samples in µs."""
-    steps = list(trace(name).replay(anew=True))
+    """Counts of samples and exchanges; ages of samples in µs; means of what the clocks know, in ns."""
+    given, made = trace(name), list[Clocks]()
+    for _, state in given._snapshots:
+        for sensor in state["sensors"]:
+            if sensor["events"]:
+                sensor["events"]["_half_loop_ns"] += BEHIND_NS
+    begin = given._begin_anew
+
+    def begun(*known: Any) -> Clocks:
+        made.append(begin(*known))
+        return made[-1]
+
+    with mock.patch.object(given, "_begin_anew", begun):
+        steps, known = [], [0.0] * len(KNOWN)
+        for step in given.replay(anew=True):
+            steps.append(step)
+            for place, value in enumerate(_known(made[-1], step)):
+                known[place] += value
     kinds = Counter(step.record.kind for step in steps)
     new = [step for step in steps if step.record.kind is RecordKind.FRESH]
     ages = sorted(
@@ -39,7 +59,34 @@ def decisions(name: str) -> dict[str, int]:
         "by_events": sum(step.by_events for step in new),
         "age_p50_us": round(ages[len(ages) // 2] / 1e3),
         "age_p99_us": round(ages[len(ages) * 99 // 100] / 1e3),
+        "age_mean_ns": round(sum(ages) / len(ages)),
+        **{name: round(value / len(steps)) for name, value in zip(KNOWN, known, strict=True)},
     }
+
+
+KNOWN: Final = (
+    "next_poll_ns", "next_in_flight_ns", "next_unanswered_ns", "uncertainty_ns", "period_error_ns",
+    "phase_deviation_ns", "patience_ns", "taking_over_ns", "late_ns", "lacks_event_ppm", "local_doubt_ns",
+    "local_moved_ns", "local_short_ns", "local_excess_ns", "local_rate_ppt",
+)  # fmt: skip
+
+
+def _known(clocks: Clocks, step: Decision) -> Iterator[float]:
+    """Each of `KNOWN`, after a record; 0 for what is not known."""
+    clock, round_trip, sent_ns = clocks.sensors[step.record.sensor], clocks.round_trip, step.record.sent_ns
+    for unanswered, in_flight in (0, False), (0, True), (2, True):
+        yield clock.next_poll_ns(sent_ns, unanswered, in_flight=in_flight) - sent_ns
+    yield clock.uncertainty_ns if math.isfinite(clock.uncertainty_ns) else 0.0
+    yield clock.period_ns - clock.phase._nominal_ns
+    yield math.sqrt(clock.phase.variance)
+    yield from (round_trip.patience_ns, round_trip.taking_over_ns, round_trip.late_ns)
+    yield 1e6 * (clock.events is not None and clock.events.lacks_event)
+    if local := clock.events and clock.events.local_clock:
+        short_ns = local.short_ns if math.isfinite(local.short_ns) else 0.0
+        yield from (local.doubt_ns, local.moved_ns, short_ns, local.excess_ns)
+        yield 1e12 * (local.phase.period_ns - 1)
+    else:
+        yield from (0.0,) * 5
 
 
 if __name__ == "__main__":
