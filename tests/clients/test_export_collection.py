@@ -12,8 +12,8 @@ import pytest
 from pyarrow import dataset, parquet
 
 from bota_clients import progress
+from bota_clients.export import batches, table
 from bota_clients.export.cli import main
-from bota_clients.export.collection import batches, table
 from tests.clients.recordings import START_NS, describe, frame, record, write
 from tests.ended import run_here
 

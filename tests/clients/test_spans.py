@@ -228,7 +228,7 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path, program: Callable[
         program(path)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peaks[1] < 1.1 * peaks[0]
+    assert peaks[1] < peaks[0] + (4 << 20)  # as of buffers that were not full; samples would take 30 MB
 
 
 @pytest.mark.parametrize(

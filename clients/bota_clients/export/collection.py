@@ -32,7 +32,6 @@ from bota_clients.program import interrupt_on_signals, say
 from bota_clients.progress import progress, switch_off
 from bota_clients.recording.reader import Recording, open_recording
 from bota_ethercat.errors import FileError, ProtocolError
-from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program.version import VERSION
 
 _GROUP: Final = 131_072  # rows
@@ -60,25 +59,6 @@ def tables_of(options: argparse.Namespace, recording: Recording, sensor: int | N
         rows = arrow_of(block, said)
         numbers = pa.repeat(pa.scalar(0, pa.int32()), len(rows))
         yield rows.append_column("recording", pa.DictionaryArray.from_arrays(numbers, [recording.path.name]))
-
-
-def batches(
-    path: str | Path, sensor: int | None = None, *, tool: str | Path | None = None, imu_units: str = "g_dps"
-) -> Iterator[Any]:
-    """The samples of a sensor as tables of `pyarrow`, some 100,000 rows each (docs/datasets.md).
-
-    With `tool`, a file of `ethercat-identify --yaml`, also the compensated wrench. RecordingError.
-    """
-    options = argparse.Namespace(imu_units=ImuUnits(imu_units), tool=None if tool is None else Path(tool))
-    with open_recording(Path(path)) as recording:
-        yield from tables_of(options, recording, sensor)
-
-
-def table(path: str | Path, sensor: int | None = None, **options: Any) -> Any:
-    """As `batches`, in one table."""
-    import pyarrow as pa  # noqa: PLC0415 - of the extra `dataset`
-
-    return pa.concat_tables(batches(path, sensor, **options))
 
 
 def _source(path: Path, options: argparse.Namespace) -> tuple[str, str]:
