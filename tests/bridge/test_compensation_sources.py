@@ -111,6 +111,7 @@ def test_gravity_that_the_accelerometer_contradicts_at_rest_is_a_warning(
     node.run(4.0)
     told = node.until(compensation="warn")["compensation"]
     assert re.search("is 17[0-9]° from the accelerometer's: check the signs", told.message)
+    assert node.log.count("wrench_compensated is wrong: gravity by the robot's orientation is 17") == 1
     robot.quaternion = UPRIGHT
     node.run(4.0)
     node.until(compensation="ok")

@@ -135,7 +135,10 @@ class CompensationControl:
         if payload.mass:
             parts.append("weight and inertia of the tool" if source.is_imu else "weight of the tool")
         if payload.mass and output.sample is not None:
+            before = self._gravity.problem
             self._gravity.look(output.sample, output.felt, output.time_s, by_imu=source.is_imu)
+            if self._gravity.problem not in ("", before):
+                self._log.warning(f"wrench_compensated is wrong: {self._gravity.problem}")
         none = "nothing is subtracted: there is no bias and no tool_mass"
         good = f"subtracted: {', '.join(parts)}" if parts else none
         return CompensationState(
