@@ -39,6 +39,8 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         help="not CSV: also the compensated wrench, with these parameters of the ROS 2 node")  # fmt: skip
     add("--mcap", type=Path, metavar="OUT",
         help="write the recording into a complete MCAP file, also if it was cut off")  # fmt: skip
+    add("--ros", type=Path, metavar="OUT",
+        help="write the samples as ROS topics (wrench, imu/data_raw, ...) into an MCAP file")  # fmt: skip
     add_force(made)
     group = made.add_argument_group("for each camera frame")
     add = group.add_mutually_exclusive_group().add_argument
@@ -55,7 +57,11 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         help="clock of the stamps, by 'ethercat-export align' (default: the server's)")  # fmt: skip
     add("--strict", action="store_true",
         help="refuse frames outside of the recording (default: their windows are not valid)")  # fmt: skip
-    options = made.parse_intermixed_args(argv)
+    return _checked(made, made.parse_intermixed_args(argv))
+
+
+def _checked(made: Parser, options: argparse.Namespace) -> argparse.Namespace:
+    """With `recordings` of a data set, `output` and `suffix`; exits with 2 for what does not go together."""
     has_frames = options.at is not None or options.fps is not None
     outputs: list[str] = options.output
     is_folder = len(outputs) > 1 or any(
@@ -64,8 +70,8 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     options.recordings = [options.recording, *map(Path, outputs[:-1])] if is_folder else []
     options.output = Path(outputs[-1]) if outputs else None
     if is_folder:
-        if options.mcap or options.all or has_frames:
-            made.error("a data set has all samples: omit --mcap, --all, --at, --fps")
+        if options.mcap or options.ros or options.all or has_frames:
+            made.error("a data set has all samples: omit --mcap, --ros, --all, --at, --fps")
         if options.output.suffix or options.output.is_file():
             made.error(f"{options.output}: with several recordings the last name is that of a folder")
         return options
@@ -75,23 +81,29 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         made.error(
             "--mcap writes the messages as they are: omit the other output, --all, --tool, --at, --fps"
         )
+    if options.ros and (options.output or options.mcap or options.all or has_frames):
+        made.error("--ros writes all samples: omit the other output, --mcap, --all, --at, --fps")
     if not options.recording.name:
         made.error(f"{options.recording} is no recording: name an .mcap file")
     options.output = (
-        options.mcap or options.output or options.recording.with_suffix(DATASETS[0] if has_frames else ".csv")
+        options.mcap
+        or options.ros
+        or options.output
+        or options.recording.with_suffix(DATASETS[0] if has_frames else ".csv")
     )
     if options.output.absolute() == options.recording.absolute():
         made.error("the output would overwrite the recording: give another name")
-    suffix = options.suffix = "" if options.mcap else options.output.suffix.lower()
+    is_mcap = bool(options.mcap or options.ros)
+    suffix = options.suffix = "" if is_mcap else options.output.suffix.lower()
     if has_frames and suffix not in DATASETS:
         made.error(f"windows of samples, with --at or --fps, are written as {', '.join(DATASETS)} only")
     if suffix == ".zarr" and not has_frames:
         made.error(
             "all samples are written as CSV, .parquet or .npz: choose one of these, or use --at or --fps"
         )
-    if not options.mcap and suffix not in {".csv", *DATASETS}:
+    if not is_mcap and suffix not in {".csv", *DATASETS}:
         made.error(f"{options.output}: the name must end in .csv, .mcap or {', '.join(DATASETS)}")
-    if options.tool and suffix not in DATASETS:
+    if options.tool and not options.ros and suffix not in DATASETS:
         made.error("CSV has no compensated wrench: omit --tool, or write .parquet or .npz")
     if options.all and suffix in DATASETS:
         made.error("--all is for CSV only: omit it")
@@ -129,7 +141,8 @@ def run(options: argparse.Namespace) -> int:
     """
     from bota_clients.recording.reader import open_recording  # noqa: PLC0415 - needs the extra
 
-    module = "whole" if options.mcap else "dataset" if options.suffix in DATASETS else "csv_table"
+    module = "dataset" if options.suffix in DATASETS else "csv_table"
+    module = "whole" if options.mcap else "ros_topics" if options.ros else module
     write = import_module(f"bota_clients.export.{module}").write
     interrupt_on_signals()
     try:

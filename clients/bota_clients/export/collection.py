@@ -23,9 +23,9 @@ from typing import Any, Final, NamedTuple
 
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import PROGRAM
-from bota_clients.export.dataset import about, arrow_of, in_chunks, parquet_writer
+from bota_clients.export.dataset import about, arrow_of, in_chunks, parquet_writer, windows_for
 from bota_clients.export.samples import MOST_LOST, samples_of
-from bota_clients.export.windows import Windows, read_tool
+from bota_clients.export.windows import read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.program import interrupt_on_signals, say
@@ -52,9 +52,8 @@ def tables_of(options: argparse.Namespace, recording: Recording, sensor: int | N
     import pyarrow as pa  # noqa: PLC0415 - of the extra `dataset`
 
     chosen = choose(recording, sensor)
-    tool = options.tool and read_tool(options.tool)
-    windows = Windows(MOST_LOST, tool=tool, imu_units=options.imu_units)
-    said = json.dumps(about(options, recording, chosen, tool=tool), default=str)
+    windows = windows_for(options, recording, chosen, MOST_LOST)
+    said = json.dumps(about(options, recording, chosen, tool=windows.tool), default=str)
     for block in in_chunks(samples_of(recording, windows, chosen.sensor), _GROUP):
         rows = arrow_of(block, said)
         numbers = pa.repeat(pa.scalar(0, pa.int32()), len(rows))

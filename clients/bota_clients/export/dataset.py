@@ -428,27 +428,32 @@ def windows_of(
         raise RecordingError("the recording is too short for a frame")
 
 
-def write(options: argparse.Namespace, recording: Recording) -> str:
-    """All samples, or windows for the frames that are asked for, into a file; says what it has."""
-    clock = options.clock and ForeignClock.read(options.clock)
+def windows_for(
+    options: argparse.Namespace, recording: Recording, sensor: RecordedSensor, length: int
+) -> Windows:
+    """With the tool that is asked for; RecordingError if it cannot compensate anything in the recording."""
     tool = options.tool and read_tool(options.tool)
-    length, sensor, path = int(options.window), choose(recording, options.sensor), options.output
-    frames: Periodic | Stamped | None = Periodic(options.fps) if options.fps else None
-    if options.at is not None:
-        stamps = read_stamps(options.at, options.column)
-        frames = Stamped(stamps, str(options.at), options.latency, clock, strict=options.strict)
     if tool and any(tool.get("bias", ())):
         _check_offsets(options.tool, tool, recording, sensor.offsets)
-    axis, windows = (
-        TimeAxis(),
-        Windows(length if frames else MOST_LOST, tool=tool, imu_units=options.imu_units),
-    )
+    windows = Windows(length, tool=tool, imu_units=options.imu_units)
     if (stream := windows.stream) is not None:  # else what is compensated is marked, stretch by stretch
         has_tool = stream.plan.has_tool
         whys = {obstacle(row.info.settings, has_tool=has_tool, by_imu=True) for row in sensor.history}
         if whys and "" not in whys:
             raise RecordingError(f"the wrench cannot be compensated: {min(whys)}; or omit --tool")
-    said = json.dumps(about(options, recording, sensor, tool=tool, clock=clock), default=str)
+    return windows
+
+
+def write(options: argparse.Namespace, recording: Recording) -> str:
+    """All samples, or windows for the frames that are asked for, into a file; says what it has."""
+    clock = options.clock and ForeignClock.read(options.clock)
+    length, sensor, path = int(options.window), choose(recording, options.sensor), options.output
+    frames: Periodic | Stamped | None = Periodic(options.fps) if options.fps else None
+    if options.at is not None:
+        stamps = read_stamps(options.at, options.column)
+        frames = Stamped(stamps, str(options.at), options.latency, clock, strict=options.strict)
+    axis, windows = TimeAxis(), windows_for(options, recording, sensor, length if frames else MOST_LOST)
+    said = json.dumps(about(options, recording, sensor, tool=windows.tool, clock=clock), default=str)
     if path.exists() and not (options.force and (path.is_file() or (path / "zarr.json").exists())):
         raise FileError(f"{path} {EXISTS}")
     with tempfile.TemporaryDirectory(

@@ -68,6 +68,7 @@ class Windows:
 
     Attributes:
         begin_ns: stamp of the first sample; -1 before it.
+        tool: parameters of the node; None: there is no compensated wrench.
         stream: what compensates; None without a tool.
     """
 
@@ -79,7 +80,7 @@ class Windows:
         imu_units: ImuUnits = ImuUnits.G_DPS,
     ) -> None:
         """Of `length` samples. With a `tool`, parameters of the ROS 2 node, there is a compensated wrench."""
-        self.begin_ns = -1
+        self.begin_ns, self.tool = -1, tool
         self._length, self.imu_units = length, imu_units
         self.stream: CompensatedStream | None = None
         self._slots = np.zeros(0, _SLOT)

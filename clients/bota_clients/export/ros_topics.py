@@ -1,0 +1,135 @@
+"""What `ethercat-export RECORDING --ros OUT.mcap` does: the samples as ROS topics, for tools that show those.
+
+Names, types and frames are the node's: `wrench`, `wrench_compensated` with a tool, `imu/data_raw`,
+`temperature`. Stamps are the samples'; what was lost, repeated or invalid has no message, nor has what is
+not finite. Covariances are 0, unknown (REP 145).
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import struct
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, Any, Final, NamedTuple, cast
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from bota_clients.export.cli import PROGRAM
+from bota_clients.export.dataset import windows_for
+from bota_clients.export.samples import MOST_LOST, samples_of
+from bota_clients.export.windows import Arrays
+from bota_clients.identify.program import choose
+from bota_clients.numbers import count
+from bota_clients.recording.reader import Recording
+from bota_clients.recording.writer import DiskFile
+from bota_ethercat.program.new_file import refuse_existing
+from bota_ethercat.program.version import VERSION
+
+_STORE: Final[Any] = get_typestore(Stores.ROS2_JAZZY)
+_STAMP: Final = struct.Struct("<iI")  # behind the 4 bytes that say CDR, little-endian
+_NUMBER: Final = struct.Struct("<d")
+
+
+def _named(prefix: str, unit: str) -> list[str]:
+    return [f"{prefix}_{axis}_{unit}" for axis in "xyz"]
+
+
+class Topic(NamedTuple):
+    """A topic: the message's type, and where in its numbers, which end it, what columns are."""
+
+    name: str
+    kind: str
+    frame: str
+    places: Sequence[int]  # of each column among the float64 at the message's end
+    columns: Sequence[str]
+    valid: str = ""  # a column that says whether the others may be used
+
+    def message(self) -> bytearray:
+        """With the numbers of none."""
+        types = _STORE.types
+        time = types["builtin_interfaces/msg/Time"](0, 0)
+        header = types["std_msgs/msg/Header"](time, self.frame)
+        x_y_z, nothing = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0), np.zeros(9)
+        made = types[self.kind]
+        if self.kind.endswith("WrenchStamped"):
+            made = made(header, types["geometry_msgs/msg/Wrench"](x_y_z, x_y_z))
+        elif self.kind.endswith("Imu"):
+            no_orientation = np.array([-1.0, *[0.0] * 8])
+            turned = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 0.0)
+            made = made(header, turned, no_orientation, x_y_z, nothing, x_y_z, nothing)
+        else:
+            made = made(header, 0.0, 0.0)
+        return bytearray(_STORE.serialize_cdr(made, self.kind))
+
+
+_WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
+_IMU: Final = "sensor_msgs/msg/Imu"
+TOPICS: Final = (
+    Topic("wrench", _WRENCH, "ft_sensor", range(6), _named("force", "N") + _named("torque", "Nm")),
+    Topic(
+        "wrench_compensated", _WRENCH, "ft_sensor", range(6),
+        _named("compensated_force", "N") + _named("compensated_torque", "Nm"), "compensated_valid",
+    ),
+    Topic(
+        "imu/data_raw", _IMU, "ft_sensor_imu", (13, 14, 15, 25, 26, 27),
+        _named("angular_rate", "rad_s") + _named("acceleration", "m_s2"),
+    ),
+    Topic("temperature", "sensor_msgs/msg/Temperature", "ft_sensor", (0,), ["temperature_degC"]),
+)  # fmt: skip
+_NUMBERS: Final = {_WRENCH: 6, _IMU: 37}  # float64 at the end; of others 2
+
+
+def write(options: argparse.Namespace, recording: Recording) -> str:
+    """The topics of a sensor into a file; says how many messages. RecordingError."""
+    path, sensor = options.output, choose(recording, options.sensor)
+    windows = windows_for(options, recording, sensor, MOST_LOST)
+    refuse_existing(path, force=options.force)
+    with tempfile.TemporaryDirectory(
+        prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
+    ) as folder:
+        made = Path(folder, path.name)
+        with contextlib.closing(DiskFile(made, overwrite=False)) as disk:
+            writer: Any = Writer(cast("IO[Any]", disk), compression=CompressionType.ZSTD)
+            writer.start("ros2", f"{PROGRAM} {VERSION}")
+            wanted = [topic for topic in TOPICS if windows.stream or not topic.valid]
+            senders, sent = [_Sender(writer, topic) for topic in wanted], 0
+            for block in samples_of(recording, windows, sensor.sensor):
+                sent += sum(each.send(block) for each in senders)
+                disk.flush()
+            writer.finish()
+            disk.flush()
+        made.replace(path)
+    return f"{count(sent, 'message')} on {', '.join(topic.name for topic in wanted)}"
+
+
+class _Sender:
+    """Writes one topic."""
+
+    def __init__(self, writer: Writer, topic: Topic) -> None:
+        definition = _STORE.generate_msgdef(topic.kind)[0]
+        schema = writer.register_schema(topic.kind, "ros2msg", definition.encode())
+        self._writer, self._topic, self._sequence = writer, topic, 0
+        self._channel = writer.register_channel(f"/{topic.name}", "cdr", schema)
+        self._message = topic.message()
+        self._begin = len(self._message) - 8 * _NUMBERS.get(topic.kind, 2)
+
+    def send(self, block: Arrays) -> int:
+        """The samples of these rows of which all numbers are known; how many."""
+        topic, message, begin = self._topic, self._message, self._begin
+        values = np.column_stack([block[name] for name in topic.columns]).astype(np.float64)
+        known = np.isfinite(values).all(axis=1)
+        if topic.valid:
+            known &= block[topic.valid]
+        stamps = block["stamp_utc"][known].astype(np.int64).tolist()
+        for stamp_ns, row in zip(stamps, values[known].tolist(), strict=True):
+            _STAMP.pack_into(message, 4, *divmod(stamp_ns, 10**9))
+            for place, value in zip(topic.places, row, strict=True):
+                _NUMBER.pack_into(message, begin + 8 * place, value)
+            self._writer.add_message(self._channel, stamp_ns, bytes(message), stamp_ns, self._sequence)
+            self._sequence += 1
+        return len(stamps)
