@@ -54,6 +54,8 @@ def brought(
         pytest.param({"before": -900, "sent": 60, "is_doubtful": True}, 1, True, id="so was the one before"),
         pytest.param({"before": -1900, "sent": 60, "lost_track": True}, 1, True, id="without an event"),
         pytest.param({"before": -100, "sent": 60, "lost_track": True}, 1, False, id="only one can have come"),
+        pytest.param({"before": -870, "sent": 60, "lost_track": True}, 1, False, id="within a period, too"),
+        pytest.param({"before": -900, "sent": 60, "lost_track": True}, 1, True, id="not beyond one"),
         pytest.param({"before": -600, "sent": -550, "has_events": True}, 0, False, id="too early"),
     ],
 )

@@ -231,6 +231,16 @@ def test_what_was_uncertain_is_told_where_it_is_counted() -> None:
     assert found((0, False)) == [("uncertain", "a sample that was counted as lost came late")]
 
 
+def test_of_what_was_before_the_first_record_nothing_is_known() -> None:
+    steps = [
+        Decision(Record(at, 10**5, 0, 0, 0, RecordKind.FRESH, False, 3), at, count, count == 1, True, False)
+        for at, count in ((10**9, 1), (10**9 + 10**6, 2))
+    ]
+    assert [loss[2:] for loss in find_losses(0, steps)] == [
+        ("uncertain", "1 lost: what came before is not in the trace")
+    ]
+
+
 def test_a_trace_is_shown_line_by_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a pause of 20 s in it."""
     steps = list[Decision]()
