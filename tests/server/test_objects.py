@@ -24,7 +24,7 @@ from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.datagrams import Steps, T, finish
 from ethercat_server.ethercat.slave.al import AlStatus
-from ethercat_server.ethercat.slave.coe import Emergencies, Emergency, MailboxSdo
+from ethercat_server.ethercat.slave.coe import Emergencies, Emergency, MailboxSdo, _answer
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sensor.objects.access import write
 from ethercat_server.sensor.objects.dictionary import (
@@ -296,6 +296,45 @@ def test_each_request_is_done_once_whatever_counter_another_master_left(
         slave.clock.sleep(1)
         finish(sdo.drain(10), slave.clock)  # what another master does
     assert set(slave.counters) == set(range(2, 8)), "SOEM's mapping begins with 1, where the bus comes up"
+
+
+def test_a_lost_datagram_does_not_have_a_write_done_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a slow slave, whose answer is still to come."""
+    slave, lost = CountingSlave(0.0, 0.03), [True]
+    sdo, read_register = MailboxSdo(cast(Bus, slave), 0, MAILBOXES), slave.read_register
+
+    def losing(*where: int) -> Steps[bytes | None]:
+        answer = yield from read_register(*where)
+        return None if slave.written and lost and lost.pop() else answer
+
+    monkeypatch.setattr(slave, "read_register", losing)
+    finish(sdo.read(0x8001, 1), slave.clock)
+    finish(sdo.write(0x8001, 1, b"efgh"), slave.clock)
+    assert (slave.written, lost) == ([b"efgh"], [])
+
+
+@pytest.mark.parametrize(
+    ("service", "command", "of", "size", "is_answer"),
+    [
+        (3, 0x43, (0x8001, 1), 10, True),
+        (3, 0x43, (0x8001, 1), 9, False),
+        (3, 0x41, (0x8001, 1), 14, True),
+        (3, 0x60, (0x8001, 1), 10, False),
+        (3, 0x43, (0x8001, 2), 10, False),
+        (3, 0x43, (0x8002, 1), 10, False),
+        (2, 0x43, (0x8001, 1), 10, False),
+        (2, 0x80, (0x8001, 1), 10, True),
+        (3, 0x80, (0x8001, 1), 10, True),
+        (1, 0x43, (0x8001, 1), 10, False),
+        (1, 0x80, (0x8001, 1), 10, False),
+    ],
+)
+def test_which_message_is_the_answer(
+    service: int, command: int, of: tuple[int, int], size: int, is_answer: bool
+) -> None:
+    data = bytes(range(1, 9))
+    body = (struct.pack("<HBHB", service << 12 | 5, command, *of) + data)[:size]
+    assert _answer(body, 0x8001, 1, 0x40) == ((command, data[: size - 6]) if is_answer else None)
 
 
 def test_an_answer_about_another_object_is_left_alone_and_a_refusal_is_not() -> None:

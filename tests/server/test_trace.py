@@ -10,6 +10,7 @@ import struct
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
@@ -17,7 +18,7 @@ from ethercat_server.daemon.traces import Traces
 from ethercat_server.doctor.cli import main as doctor
 from ethercat_server.doctor.trace import find_losses, show
 from ethercat_server.sampling.replay import Decision, Record, Trace, TraceError
-from ethercat_server.sampling.trace import RECORD, RecordKind
+from ethercat_server.sampling.trace import RECORD, Clocks, RecordKind, Ring
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.simulation.server import MemoryChannel
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -103,6 +104,45 @@ def test_the_ring_has_the_last_minute_and_is_read_while_it_goes_on() -> None:
     seconds = (trace.records[-1].sent_ns - trace.records[0].sent_ns) * 1e-9
     assert 40 < seconds <= 100
     check_replay(simulation)
+
+
+def test_what_the_ring_has_lost_meanwhile_is_zeros() -> None:
+    """A ring of three records, and a file that begins with the oldest snapshot that is still in it."""
+    ring, made = Ring(0.02), list[bytes]()
+
+    def add(*numbers: int) -> None:
+        for n in numbers:
+            exchange = (1000 + n, 1500 + 2 * n, b"", 3, 0)
+            ring.add([(exchange, (n, n % 2, 7 * n, 1), 4, RecordKind.FRESH)])
+            made.append(RECORD.pack(1000 + n, 500 + n, n, 7 * n, 4, 1 | 0x80 * (n % 2), 3))
+
+    def snapshot(number: int) -> None:
+        ring.snapshot(cast("Clocks", SimpleNamespace(state=lambda: {"number": number})))
+
+    snapshot(0)
+    add(0, 1)
+    snapshot(1)
+    add(2)
+    snapshot(2)
+    add(3)
+    frozen = ring.freeze({"about": "it"})
+    header = json.loads(frozen.header)
+    assert header["snapshots"] == [{"before": 0, "number": 1}, {"before": 1, "number": 2}]
+    assert (header["about"], header["version"], frozen.header[-1:]) == ("it", 1, b"\n")
+
+    def whole(step: int) -> bytes:
+        parts = [frozen.read(at, step) for at in range(0, frozen.size, step)]
+        assert [len(part) for part in parts[:-1]] == [step] * (len(parts) - 1)
+        return b"".join(parts).removeprefix(frozen.header)
+
+    assert whole(7) == whole(10_000) == b"".join(made[2:])
+    assert frozen.read(frozen.size, 5) == b""
+    add(4)
+    assert whole(10_000) == b"".join(made[2:4]), "what came later is not in it"
+    add(5)
+    assert whole(24) == bytes(24) + made[3]
+    add(6)
+    assert ring.freeze({}).size == len(ring.freeze({}).header), "no snapshot is left"
 
 
 def test_a_file_is_hostile() -> None:
