@@ -530,6 +530,47 @@ def test_a_sensor_that_turns_fast_is_not_at_rest_however_steadily() -> None:
     assert tared["residual"] == [0.0] * 6
 
 
+class FullBus(GivenBus):
+    """A mailbox with these messages in it: protocol, CoE service, body."""
+
+    def __init__(self, *messages: tuple[int, int, bytes]) -> None:
+        super().__init__()
+        self.clock, self.reads = ManualClock(), 0
+        self.messages = [*messages]
+
+    def read_register(self, slave: int, address: int, size: int) -> Steps[bytes]:
+        yield from ()
+        self.reads += 1
+        if not self.messages:
+            return b""
+        protocol, service, body = self.messages.pop(0)
+        coe = struct.pack("<H", service << 12) + body
+        return (struct.pack("<HHBB", len(coe), 0, 0, protocol) + coe).ljust(size, b"\0")
+
+
+def test_what_else_is_in_a_mailbox_is_left_alone_and_emergencies_are_noted() -> None:
+    emergency, answer = (
+        struct.pack("<HB", 0x4210, 1) + b"abcde",
+        struct.pack("<BHB", READ, PROBED, 0) + b"efgh",
+    )
+    bus = FullBus((2, 3, answer), (3, 1, emergency), (4, 1, emergency), (3, 3, answer))
+    known = Emergencies(bus.clock)
+    sdo = MailboxSdo(cast(Bus, bus), 7, MAILBOXES, known)
+    assert finish(sdo.read(PROBED, 0), bus.clock) == b"efgh"
+    assert known.status(7)["emergencies"] == 1
+    bus.messages = [(3, 1, emergency)] * 3
+    finish(sdo.poll_mailbox(), bus.clock)
+    assert (known.status(7)["emergencies"], len(bus.messages)) == (2, 2)
+    sdo._in_use = True
+    finish(sdo.poll_mailbox(), bus.clock)
+    assert len(bus.messages) == 2, "the transfer reads them itself"
+    for most, reads in ((1, 1), (5, 2)):
+        bus.reads = 0
+        finish(sdo.drain(most), bus.clock)
+        assert bus.reads == reads
+    assert known.status(7)["emergencies"] == 4
+
+
 # -- emergencies
 
 

@@ -315,6 +315,36 @@ def test_a_trace_is_shown_line_by_line(tmp_path: Path, monkeypatch: pytest.Monke
     assert (len(lines), lines[-1]) == (31, "(2 more)")
 
 
+def test_sensors_are_shown_one_by_one_and_their_losses_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The header does not describe the second one."""
+    steps = [
+        Decision(Record(at, 10**5, 0, 0, sensor, RecordKind.FRESH, False, 3), at, steps, False, True, True)
+        for number in range(40)
+        for sensor, lost in ((0, 30), (2, 20))
+        for at, steps in [(10**9 + number * 10**7 + sensor, 1 + (number == lost))]
+    ]
+    made = SimpleNamespace(about={"program": "x 1", "sensors": [{"model": "M8"}]}, records=[*steps])
+    made.replay = lambda: iter(steps)
+    monkeypatch.setattr("ethercat_server.doctor.trace.Trace", lambda _: made)
+    (path := tmp_path / "a.trace").write_bytes(b"")
+    lines = [*show(path)]
+    table = [
+        "  0.4 s: 40 samples, 1 lost, 0 polls without a new sample, 0 invalid exchanges",
+        "  age when it was here p50 100, p99 100, max 100 µs",
+        "  followed 100 % of the time, dated by the slave controller 100 %",
+        "  exchanges p50 100, p99 100, max 100 µs",
+    ]
+    assert lines == [
+        "written by x 1, 80 records",
+        "\nsensor 0 (M8)", *table, "      0 s ...s", lines[7],
+        "\nsensor 2 (None)", *table, "      0 s ..s.", lines[7],
+        "   0.2000 s  sensor 2: 1 lost: it was polled and gave none",
+        "   0.3000 s  sensor 0: 1 lost: it was polled and gave none",
+    ]  # fmt: skip
+
+
 def test_who_may_not_control_the_server_gets_no_trace() -> None:
     simulation = Simulation()
     simulation.run(0.2)
