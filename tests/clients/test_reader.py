@@ -63,6 +63,9 @@ def test_frames_come_back_byte_for_byte(path: Path) -> None:
     record(path, [extreme], sensors=(255,))
     with open_recording(path) as recording:
         assert list(recording.frames(255)) == [extreme]
+        found = recording.columns(255)
+    assert found.stamp_ns == found.monotonic_ns == found.sequence == [2**63 - 1], "the latest there is"
+    assert (found.flags, found.wkc) == ([255], [65535])
 
 
 def test_sensors_are_told_apart(path: Path) -> None:
