@@ -65,7 +65,7 @@ def test_frames_come_back_byte_for_byte(path: Path) -> None:
         assert list(recording.frames(255)) == [extreme]
         found = recording.columns(255)
     assert found.stamp_ns == found.monotonic_ns == found.sequence == [2**63 - 1], "the latest there is"
-    assert (found.flags, found.wkc) == ([255], [65535])
+    assert (found.flags.tolist(), found.wkc.tolist()) == ([255], [65535])
 
 
 def test_sensors_are_told_apart(path: Path) -> None:
@@ -99,6 +99,14 @@ def test_settings_are_known_over_time(path: Path) -> None:
         assert recording.events[0].name == "reconfigured"
         assert not recording.events[0].by_recorder
         assert recording.end == {"reason": "asked to"}
+
+
+def test_before_it_was_told_what_is_in_force_is_what_was_told_first(path: Path) -> None:
+    told = [describe(0) | {"sensors": [describe(0)["sensors"][0] | {"rate_hz": hz}]} for hz in (800, 1600)]
+    write(path, [frame(0), frame(1), told[0], frame(2), told[1], frame(3)])
+    with open_recording(path) as recording:
+        found = [(in_force.info.rate_hz, batch.sequence.tolist()) for in_force, batch in recording.batches(0)]
+    assert found == [(800, [0, 1]), (800, [2]), (1600, [3])]
 
 
 def test_columns_are_what_the_decoder_gives(path: Path) -> None:
