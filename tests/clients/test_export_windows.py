@@ -194,6 +194,22 @@ def tared(path: Path, told: Sequence[Any], steps: Sequence[float]) -> Path:
     return path
 
 
+@pytest.mark.parametrize("fir", [False, True])
+def test_after_another_filter_no_sample_comes_before_those_that_were_sent_before_it(fir: bool) -> None:
+    """It may have been measured before them."""
+    made, numbers = Windows(8), np.arange(100)
+    for begin, has_fir in ((0, not fir), (50, fir)):
+        settings = SETTINGS | {"fir": has_fir}
+        made.configure(InForce(SensorInfo(settings=settings, rate_hz=RATE_HZ)))
+        made.add(columns([frame(number) for number in range(begin, begin + 50)]))
+    delays = np.where((numbers < 50) == fir, 1.5, 12.0)
+    measured = np.maximum.accumulate(numbers - delays)
+    for at in np.arange(30.25, min(measured.max(), 96.0)):
+        newest = int((measured <= at).sum()) - 1
+        found = made.at(np.array([round(at * PERIOD_NS)]))["force_torque"][0, :, 0]
+        assert found.tolist() == [*range(newest - 7, newest + 1)], at
+
+
 @pytest.mark.parametrize("slow", ["acceleration_filter", "angular_rate_filter", ""])
 def test_what_is_forgotten_is_in_no_window_of_that_instant(slow: str) -> None:
     """Whichever channel is the latest; nor is it kept."""

@@ -235,6 +235,25 @@ def test_what_is_past_is_told_at_its_worst_and_at_its_last_time(model: Model) ->
     assert alert.ago_s == pytest.approx(0.25, abs=0.1)
 
 
+def test_what_was_trouble_is_told_as_that_however_little_is_wrong_later(model: Model) -> None:
+    """A rate, which has no size."""
+    moment, number = frame(0).monotonic_ns, 0
+    for periods in (2.0, 1.05, 1.0):
+        for _ in range(40):
+            frames = list[DataMessage]()
+            for _ in range(50):
+                moment, number = moment + round(periods * made.PERIOD_NS), number + 1
+                frames.append(frame(number, REST)._replace(monotonic_ns=moment))
+            at_s = now(0) + (moment - frame(0).monotonic_ns) * 1e-9
+            model.add_frames(frames, at_s)
+        if periods > 1:
+            (alert,) = only(model, at_s).alerts
+            assert (alert.level, alert.ago_s) == (Level.TROUBLE if periods > 1.5 else Level.LOOK, None)
+    (alert,) = only(model, at_s).alerts
+    assert alert.ago_s
+    assert alert.level is Level.TROUBLE
+
+
 def test_the_latest_of_what_is_past_and_the_worst_of_what_is_present_come_first(model: Model) -> None:
     model.connected(description(("BFT-SENS-ECAT-M8",) * 2), made.OWN_PEER, START_S)
     hot: dict[str, float] = {"temperature": LIMITS.temperature_warn + 1}

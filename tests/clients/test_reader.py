@@ -10,6 +10,7 @@ import zlib
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import pytest
 import zstandard
 from mcap.reader import NonSeekingReader
@@ -17,7 +18,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
-from bota_clients.recording.columns import columns, joined
+from bota_clients.recording.columns import RECORD, columns, joined, table_of
 from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
 from bota_clients.recording.mcap_file import MAX_CHUNK, McapFile
 from bota_clients.recording.order import AtLastOffset
@@ -64,6 +65,9 @@ def test_frames_come_back_byte_for_byte(path: Path) -> None:
     record(path, [extreme], sensors=(255,))
     with open_recording(path) as recording:
         assert list(recording.frames(255)) == [extreme]
+        found = recording.columns(255)
+    assert found.stamp_ns == found.monotonic_ns == found.sequence == [2**63 - 1], "the latest there is"
+    assert (found.flags.tolist(), found.wkc.tolist()) == ([255], [65535])
 
 
 def test_sensors_are_told_apart(path: Path) -> None:
@@ -97,6 +101,14 @@ def test_settings_are_known_over_time(path: Path) -> None:
         assert recording.events[0].name == "reconfigured"
         assert not recording.events[0].by_recorder
         assert recording.end == {"reason": "asked to"}
+
+
+def test_before_it_was_told_what_is_in_force_is_what_was_told_first(path: Path) -> None:
+    told = [describe(0) | {"sensors": [describe(0)["sensors"][0] | {"rate_hz": hz}]} for hz in (800, 1600)]
+    write(path, [frame(0), frame(1), told[0], frame(2), told[1], frame(3)])
+    with open_recording(path) as recording:
+        found = [(in_force.info.rate_hz, batch.sequence.tolist()) for in_force, batch in recording.batches(0)]
+    assert found == [(800, [0, 1]), (800, [2]), (1600, [3])]
 
 
 def test_columns_are_what_the_decoder_gives(path: Path) -> None:
@@ -178,6 +190,42 @@ def test_any_valid_file_is_read_as_the_mcap_library_reads_it(tmp_path: Path, see
         assert [each.event for each in recording.events] == [
             file_format.unpack_json(data, topic) for topic, data in told if topic == topics[2]
         ]
+
+
+@pytest.mark.parametrize("size", [61, 77])
+@pytest.mark.parametrize("name", ["", "cdr", "sensor", "length", "size"])
+def test_what_is_no_frame_of_the_sensor_is_an_error_wherever_it_is(path: Path, name: str, size: int) -> None:
+    record(path, [frame(number, size=size, sensor=3) for number in range(5)], sensors=(3,))
+    with open_recording(path) as recording:
+        ((_, *parts),) = [[*recording._parts(recording._channels(3))]]
+        ((rows, sensors),) = cast("list[tuple[Any, Any]]", parts)
+        rows = rows.copy()
+    if not name:
+        assert table_of([rows[:2], rows[2:]], sensors)["sequence"].tolist() == [0, 1, 2, 3, 4]
+        return
+    assert RECORD.fields is not None
+    at = int(RECORD.fields[name][1])
+    for row in range(5):
+        broken = rows.copy()
+        broken[row, at] ^= 1
+        with pytest.raises(RecordingError):
+            table_of([broken], sensors)
+
+
+def test_frames_of_both_sizes_are_read_together(path: Path) -> None:
+    """In one table, as far as a batch goes; what only one has is not known of the other."""
+    orientation: dict[str, Any] = {"orientation.x": 0.5, "orientation.w": 0.25}
+    made = [frame(n, size=61 + 16 * (n % 7 > 3), **(orientation if n % 7 > 3 else {})) for n in range(10_000)]
+    record(path, made)
+    with open_recording(path) as recording:
+        tables = [each for each in recording.tables(0) if isinstance(each, np.ndarray)]
+        assert [len(each) for each in tables] == [4096, 4096, 10_000 - 2 * 4096]
+        found = recording.columns(0)
+    assert found.sequence.tolist() == [*range(10_000)]
+    assert found.force[:, 0].tolist() == [*range(10_000)]
+    has = np.arange(10_000) % 7 > 3
+    assert (np.isfinite(found.orientation).all(axis=1) == has).all()
+    assert found.orientation[4].tolist() == [0.5, 0.0, 0.0, 0.25]
 
 
 # -- cut off
@@ -356,3 +404,18 @@ def test_only_what_is_around_a_change_of_the_sensors_own_offset_is_left_out(tmp_
     assert sorted({*range(4000)} - {*found.sequence.tolist()}) == [*range(1520, 1603), *range(2400, 3203)]
     (remark,) = (each for each in of_recording(path, ImuUnits.SI)[0].remarks if "own offset" in each)
     assert remark.startswith("The sensor's own offset was changed 2 times (by a tare, say): ")
+
+
+def test_before_a_change_that_was_announced_no_sample_is_in_doubt(tmp_path: Path) -> None:
+    items: list[Any] = [describe(0, fir=False)]
+    items[0]["sensors"][0]["offset"] = [1.0, 0, 0, 0, 0, 0]
+    for begin, end, offset in ((0, 800, None), (800, 810, [2.0, 0, 0, 0, 0, 0]), (810, 1600, None)):
+        items += [frame(number) for number in range(begin, end)]
+        if end < 1600:
+            items.append({"event": "offset_changed", "sensor": 0, "offset": offset})
+    write(path := tmp_path / "run.mcap", items)
+    with open_recording(path) as recording:
+        read = AtLastOffset(recording, recording.sensors[0], ImuUnits.SI)
+        found = joined([*read])
+    assert sorted({*range(1600)} - {*found.sequence.tolist()}) == [*range(800, 813)]
+    assert read.said == ["10 frames left out: the sensor's own offset was not known"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,7 +20,8 @@ from ethercat_server.sampling.association import (
     count_steps,
 )
 from ethercat_server.sampling.round_trip import RoundTrip
-from ethercat_server.sampling.schedule import best_margin_ns
+from ethercat_server.sampling.sample_clock import SampleClock
+from ethercat_server.sampling.schedule import Schedule, best_margin_ns
 from ethercat_server.sampling.slave_clock import LocalClock
 from ethercat_server.sampling.trust import TRANSITIONS, Evidence, Trust, TrustState
 
@@ -54,6 +56,8 @@ def brought(
         pytest.param({"before": -900, "sent": 60, "is_doubtful": True}, 1, True, id="so was the one before"),
         pytest.param({"before": -1900, "sent": 60, "lost_track": True}, 1, True, id="without an event"),
         pytest.param({"before": -100, "sent": 60, "lost_track": True}, 1, False, id="only one can have come"),
+        pytest.param({"before": -870, "sent": 60, "lost_track": True}, 1, False, id="within a period, too"),
+        pytest.param({"before": -900, "sent": 60, "lost_track": True}, 1, True, id="not beyond one"),
         pytest.param({"before": -600, "sent": -550, "has_events": True}, 0, False, id="too early"),
     ],
 )
@@ -302,3 +306,99 @@ def test_an_exchange_is_short_by_the_best_of_its_block() -> None:
     assert clock.short_ns == 140_000
     assert 0 < clock.excess_ns < 20_000
     assert clock.doubt_ns == pytest.approx(5 * math.sqrt(clock.phase.variance))
+
+
+def schedule(usual_us: float = 100, variance: float = 0.0) -> Schedule:
+    """The next sample is expected at 5 ms, then one each ms."""
+    phase: Any = SimpleNamespace(phase_ns=5e6, period_ns=1e6, variance=variance)
+    bus: Any = SimpleNamespace(
+        usual_ns=usual_us * 1e3, variance=1e8 - variance, read_variance=4e8, read_ns=3000.0, patience_ns=2e5
+    )
+    return Schedule(phase, bus)
+
+
+@pytest.mark.parametrize(
+    ("usual_us", "variance", "hits", "by_events", "margin", "aim_after", "probing"),
+    [
+        pytest.param(100, 0.0, 0, False, 16_635, 13_635, False, id="polled"),
+        pytest.param(100, 0.0, 500, False, 16_635, 13_635, False, id="polled for long"),
+        pytest.param(100, 0.0, 501, False, 16_635, 13_635, True, id="for too long"),
+        pytest.param(100, 1.02e8, 0, False, 16_635, 13_635, False, id="known"),
+        pytest.param(100, 1.03e8, 0, False, 16_635, 13_635, True, id="hardly known"),
+        pytest.param(100, 1.03e8, 0, True, 18_548, 15_548, False, id="by events"),
+        pytest.param(100, 0.0, 501, True, 18_548, -21_548, True, id="early on purpose"),
+        pytest.param(500, 0.0, 0, True, 25_805, 22_805, False, id="time for two polls"),
+        pytest.param(501, 0.0, 501, True, 34_609, 31_609, True, id="time for one"),
+    ],
+)
+def test_how_long_after_a_sample_is_expected_it_is_polled_for(
+    usual_us: float,
+    variance: float,
+    hits: int,
+    by_events: bool,
+    margin: float,
+    aim_after: float,
+    probing: bool,
+) -> None:
+    made = schedule(usual_us, variance)
+    made.count_hit(hits)
+    made.derive(by_events=by_events)
+    assert (made.margin_ns, made.aim_after_ns) == pytest.approx((margin, aim_after), abs=1)
+    assert (made.probing, made.single) == (probing, usual_us > 500)
+
+
+def test_a_margin_shrinks_with_hits_and_grows_with_early_polls_of_samples_that_polls_date() -> None:
+    made, found = schedule(), list[float]()
+    for happens in (
+        made.count_polled_hit, made.count_hit, made.count_polled_hit, lambda: made.count_early(adapts=False),
+        made.count_polled_hit, made.count_hit, made.count_polled_hit, lambda: made.count_early(adapts=True),
+        lambda: made.count_early(adapts=True),
+    ):  # fmt: skip
+        happens()
+        made.derive(by_events=False)
+        found.append(made.margin_ns / 16_635.1)
+    once, twice = 1 - 0.11 / 16, (1 - 0.11 / 16) ** 2
+    assert found == pytest.approx([1, 1, *[once] * 4, twice, 1, 1], abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("usual_us", "hits", "sent_us", "asked", "next_us"),
+    [
+        pytest.param(100, 0, 4000, {"locked": False}, 4250, id="not followed"),
+        pytest.param(100, 0, 5013, {}, 5013.635, id="before it is due"),
+        pytest.param(100, 0, 5014, {}, 5014, id="early: again at once"),
+        pytest.param(100, 0, 5014, {"overdue": True}, 5139, id="in steps"),
+        pytest.param(100, 0, 5000, {"in_flight": True}, 5013.635, id="under way"),
+        pytest.param(100, 0, 5100, {"in_flight": True, "unanswered": 2}, 5500, id="a frame was lost"),
+        pytest.param(100, 0, 5100, {"in_flight": True, "unanswered": 9}, 6100, id="all are"),
+        pytest.param(600, 0, 5000, {}, 5031.609, id="one poll each"),
+        pytest.param(600, 0, 5014, {}, 5031.609, id="half a margin before the next"),
+        pytest.param(600, 0, 5015, {}, 6031.609, id="that was for it"),
+        pytest.param(600, 0, 7100, {"in_flight": True}, 8031.609, id="they are for those before"),
+        pytest.param(600, 501, 4900, {}, 4997, id="early on purpose"),
+        pytest.param(600, 501, 4979, {}, 4997, id="with time left for it"),
+        pytest.param(600, 501, 4980, {}, 5031.609, id="without"),
+    ],
+)
+def test_when_it_is_polled_next(
+    usual_us: float, hits: int, sent_us: int, asked: dict[str, Any], next_us: float
+) -> None:
+    made = schedule(usual_us)
+    made.count_hit(hits)
+    made.derive(by_events=False)
+    given: Any = {"unanswered": 0, "in_flight": False, "locked": True, "overdue": False} | asked
+    assert made.next_poll_ns(sent_us * 1000, **given) == pytest.approx(next_us * 1e3, abs=1)
+
+
+@pytest.mark.parametrize("late", [0.25, 2.25, -0.25, 1.75])
+def test_where_polls_are_timed_by_polls_events_are_as_late_as_they_show(late: float) -> None:
+    """Whichever sample it is."""
+    events: Any = SimpleNamespace(
+        are_trusted=True, variance=0.0, instant_ns=5e6, is_doubtful=False, date=lambda *_: late
+    )
+    clock = SampleClock(1e6, RoundTrip(), events)
+    clock.phase.begin(3_999_000, 4_001_000)
+    clock._begun = clock._schedule.single = True
+    assert clock.observe(5_000_000, 5_900_000, None, fresh=True) is (round(late) == 0)
+    assert (clock.steps, clock.instant_ns) == (1 + round(late), 5e6)
+    assert clock._bias_ns == pytest.approx((late - round(late)) * 1e6 / 64)

@@ -503,6 +503,36 @@ def test_the_speed_of_a_link(
     assert nic.link_settings("ens5") == found
 
 
+@pytest.mark.parametrize(
+    ("rows", "processes", "who"),
+    [
+        ([(0x88A4, 5, 1)], {10: {1}}, "another EtherCAT master, process 10 (p10)"),
+        ([(0x88A4, 5, 1), (3, 5, 2)], {10: {1, 2}}, "a virtual sensor, process 10 (p10)"),
+        ([(0x88A4, 5, 1), (3, 6, 2)], {10: {1, 2}}, "another EtherCAT master, process 10 (p10)"),
+        ([(0x88A4, 5, 1), (3, 5, 2)], {9: {2}, 10: {1}}, "another EtherCAT master, process 10 (p10)"),
+        ([(0x88A4, 5, 1), (3, 5, 2)], {9: {2}}, "another EtherCAT master, or a virtual sensor"),
+        ([(0x88A4, 6, 1), (3, 5, 2)], {10: {1, 2}}, ""),
+    ],
+)
+def test_who_has_an_interface_is_said(
+    rows: list[tuple[int, int, int]],
+    processes: dict[int, set[int]],
+    who: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = [nic.Process(pid, f"p{pid}", sockets) for pid, sockets in processes.items()]
+    monkeypatch.setattr(nic, "look_up", lambda _: SEES)
+    monkeypatch.setattr(nic, "packet_sockets", lambda: [nic.Listener(*row) for row in rows])
+    monkeypatch.setattr(nic, "users_of", lambda inodes: (each for each in known if each.sockets & inodes))
+    monkeypatch.setattr(nic, "_name_of", lambda path: f"p{path.name}")
+    if not who:
+        nic.check_unused("near0")
+        return
+    with pytest.raises(InterfaceError) as refused:
+        nic.check_unused("near0")
+    assert str(refused.value) == f"near0 is in use by {who}: stop that one first"
+
+
 BOTH = ["CAP_NET_ADMIN", "CAP_NET_RAW"]
 
 

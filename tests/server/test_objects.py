@@ -24,7 +24,7 @@ from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.clock import SYSTEM_CLOCK
 from ethercat_server.ethercat.datagrams import Steps, T, finish
 from ethercat_server.ethercat.slave.al import AlStatus
-from ethercat_server.ethercat.slave.coe import Emergencies, Emergency, MailboxSdo
+from ethercat_server.ethercat.slave.coe import Emergencies, Emergency, MailboxSdo, _answer
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sensor.objects.access import write
 from ethercat_server.sensor.objects.dictionary import (
@@ -298,6 +298,45 @@ def test_each_request_is_done_once_whatever_counter_another_master_left(
     assert set(slave.counters) == set(range(2, 8)), "SOEM's mapping begins with 1, where the bus comes up"
 
 
+def test_a_lost_datagram_does_not_have_a_write_done_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a slow slave, whose answer is still to come."""
+    slave, lost = CountingSlave(0.0, 0.03), [True]
+    sdo, read_register = MailboxSdo(cast(Bus, slave), 0, MAILBOXES), slave.read_register
+
+    def losing(*where: int) -> Steps[bytes | None]:
+        answer = yield from read_register(*where)
+        return None if slave.written and lost and lost.pop() else answer
+
+    monkeypatch.setattr(slave, "read_register", losing)
+    finish(sdo.read(0x8001, 1), slave.clock)
+    finish(sdo.write(0x8001, 1, b"efgh"), slave.clock)
+    assert (slave.written, lost) == ([b"efgh"], [])
+
+
+@pytest.mark.parametrize(
+    ("service", "command", "of", "size", "is_answer"),
+    [
+        (3, 0x43, (0x8001, 1), 10, True),
+        (3, 0x43, (0x8001, 1), 9, False),
+        (3, 0x41, (0x8001, 1), 14, True),
+        (3, 0x60, (0x8001, 1), 10, False),
+        (3, 0x43, (0x8001, 2), 10, False),
+        (3, 0x43, (0x8002, 1), 10, False),
+        (2, 0x43, (0x8001, 1), 10, False),
+        (2, 0x80, (0x8001, 1), 10, True),
+        (3, 0x80, (0x8001, 1), 10, True),
+        (1, 0x43, (0x8001, 1), 10, False),
+        (1, 0x80, (0x8001, 1), 10, False),
+    ],
+)
+def test_which_message_is_the_answer(
+    service: int, command: int, of: tuple[int, int], size: int, is_answer: bool
+) -> None:
+    data = bytes(range(1, 9))
+    body = (struct.pack("<HBHB", service << 12 | 5, command, *of) + data)[:size]
+    assert _answer(body, 0x8001, 1, 0x40) == ((command, data[: size - 6]) if is_answer else None)
+
+
 def test_an_answer_about_another_object_is_left_alone_and_a_refusal_is_not() -> None:
     bus = GivenBus((READ, 0x8000, b"abcd"), (ABORTED, 0x8001, struct.pack("<I", 0x06090030)))
     with pytest.raises(SdoAbortError, match="refused reading object 0x8001:1: the value is out of range "):
@@ -489,6 +528,47 @@ def test_a_sensor_that_turns_fast_is_not_at_rest_however_steadily() -> None:
         run_tare(ScriptedSdo(), 100, [0.0] * 6, itertools.repeat(1.0), rate_dps=30.0)
     tared = run_tare(ScriptedSdo(), 100, [0.0] * 6, itertools.repeat(1.0), rate_dps=20.0)
     assert tared["residual"] == [0.0] * 6
+
+
+class FullBus(GivenBus):
+    """A mailbox with these messages in it: protocol, CoE service, body."""
+
+    def __init__(self, *messages: tuple[int, int, bytes]) -> None:
+        super().__init__()
+        self.clock, self.reads = ManualClock(), 0
+        self.messages = [*messages]
+
+    def read_register(self, slave: int, address: int, size: int) -> Steps[bytes]:
+        yield from ()
+        self.reads += 1
+        if not self.messages:
+            return b""
+        protocol, service, body = self.messages.pop(0)
+        coe = struct.pack("<H", service << 12) + body
+        return (struct.pack("<HHBB", len(coe), 0, 0, protocol) + coe).ljust(size, b"\0")
+
+
+def test_what_else_is_in_a_mailbox_is_left_alone_and_emergencies_are_noted() -> None:
+    emergency, answer = (
+        struct.pack("<HB", 0x4210, 1) + b"abcde",
+        struct.pack("<BHB", READ, PROBED, 0) + b"efgh",
+    )
+    bus = FullBus((2, 3, answer), (3, 1, emergency), (4, 1, emergency), (3, 3, answer))
+    known = Emergencies(bus.clock)
+    sdo = MailboxSdo(cast(Bus, bus), 7, MAILBOXES, known)
+    assert finish(sdo.read(PROBED, 0), bus.clock) == b"efgh"
+    assert known.status(7)["emergencies"] == 1
+    bus.messages = [(3, 1, emergency)] * 3
+    finish(sdo.poll_mailbox(), bus.clock)
+    assert (known.status(7)["emergencies"], len(bus.messages)) == (2, 2)
+    sdo._in_use = True
+    finish(sdo.poll_mailbox(), bus.clock)
+    assert len(bus.messages) == 2, "the transfer reads them itself"
+    for most, reads in ((1, 1), (5, 2)):
+        bus.reads = 0
+        finish(sdo.drain(most), bus.clock)
+        assert bus.reads == reads
+    assert known.status(7)["emergencies"] == 4
 
 
 # -- emergencies

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
@@ -17,7 +18,7 @@ from ethercat_server.daemon.loss_traces import LossTraces
 from ethercat_server.doctor.cli import main as doctor
 from ethercat_server.doctor.trace import find_losses, show
 from ethercat_server.sampling.replay import Decision, Record, Trace, TraceError
-from ethercat_server.sampling.trace import RECORD, RecordKind
+from ethercat_server.sampling.trace import RECORD, Clocks, RecordKind, Ring
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.simulation.server import MemoryChannel
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -103,6 +104,45 @@ def test_the_ring_has_the_last_minute_and_is_read_while_it_goes_on() -> None:
     seconds = (trace.records[-1].sent_ns - trace.records[0].sent_ns) * 1e-9
     assert 40 < seconds <= 100
     check_replay(simulation)
+
+
+def test_what_the_ring_has_lost_meanwhile_is_zeros() -> None:
+    """A ring of three records, and a file that begins with the oldest snapshot that is still in it."""
+    ring, made = Ring(0.02), list[bytes]()
+
+    def add(*numbers: int) -> None:
+        for n in numbers:
+            exchange = (1000 + n, 1500 + 2 * n, b"", 3, 0)
+            ring.add([(exchange, (n, n % 2, 7 * n, 1), 4, RecordKind.FRESH)])
+            made.append(RECORD.pack(1000 + n, 500 + n, n, 7 * n, 4, 1 | 0x80 * (n % 2), 3))
+
+    def snapshot(number: int) -> None:
+        ring.snapshot(cast("Clocks", SimpleNamespace(state=lambda: {"number": number})))
+
+    snapshot(0)
+    add(0, 1)
+    snapshot(1)
+    add(2)
+    snapshot(2)
+    add(3)
+    frozen = ring.freeze({"about": "it"})
+    header = json.loads(frozen.header)
+    assert header["snapshots"] == [{"before": 0, "number": 1}, {"before": 1, "number": 2}]
+    assert (header["about"], header["version"], frozen.header[-1:]) == ("it", 1, b"\n")
+
+    def whole(step: int) -> bytes:
+        parts = [frozen.read(at, step) for at in range(0, frozen.size, step)]
+        assert [len(part) for part in parts[:-1]] == [step] * (len(parts) - 1)
+        return b"".join(parts).removeprefix(frozen.header)
+
+    assert whole(7) == whole(10_000) == b"".join(made[2:])
+    assert frozen.read(frozen.size, 5) == b""
+    add(4)
+    assert whole(10_000) == b"".join(made[2:4]), "what came later is not in it"
+    add(5)
+    assert whole(24) == bytes(24) + made[3]
+    add(6)
+    assert ring.freeze({}).size == len(ring.freeze({}).header), "no snapshot is left"
 
 
 def test_a_file_is_hostile() -> None:
@@ -231,6 +271,16 @@ def test_what_was_uncertain_is_told_where_it_is_counted() -> None:
     assert found((0, False)) == [("uncertain", "a sample that was counted as lost came late")]
 
 
+def test_of_what_was_before_the_first_record_nothing_is_known() -> None:
+    steps = [
+        Decision(Record(at, 10**5, 0, 0, 0, RecordKind.FRESH, False, 3), at, count, count == 1, True, False)
+        for at, count in ((10**9, 1), (10**9 + 10**6, 2))
+    ]
+    assert [loss[2:] for loss in find_losses(0, steps)] == [
+        ("uncertain", "1 lost: what came before is not in the trace")
+    ]
+
+
 def test_a_trace_is_shown_line_by_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a pause of 20 s in it."""
     steps = list[Decision]()
@@ -263,6 +313,36 @@ def test_a_trace_is_shown_line_by_line(tmp_path: Path, monkeypatch: pytest.Monke
         "   4.3500 s  sensor 0: 2 lost: it was polled and gave none",
     ]
     assert (len(lines), lines[-1]) == (31, "(2 more)")
+
+
+def test_sensors_are_shown_one_by_one_and_their_losses_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The header does not describe the second one."""
+    steps = [
+        Decision(Record(at, 10**5, 0, 0, sensor, RecordKind.FRESH, False, 3), at, steps, False, True, True)
+        for number in range(40)
+        for sensor, lost in ((0, 30), (2, 20))
+        for at, steps in [(10**9 + number * 10**7 + sensor, 1 + (number == lost))]
+    ]
+    made = SimpleNamespace(about={"program": "x 1", "sensors": [{"model": "M8"}]}, records=[*steps])
+    made.replay = lambda: iter(steps)
+    monkeypatch.setattr("ethercat_server.doctor.trace.Trace", lambda _: made)
+    (path := tmp_path / "a.trace").write_bytes(b"")
+    lines = [*show(path)]
+    table = [
+        "  0.4 s: 40 samples, 1 lost, 0 polls without a new sample, 0 invalid exchanges",
+        "  age when it was here p50 100, p99 100, max 100 µs",
+        "  followed 100 % of the time, dated by the slave controller 100 %",
+        "  exchanges p50 100, p99 100, max 100 µs",
+    ]
+    assert lines == [
+        "written by x 1, 80 records",
+        "\nsensor 0 (M8)", *table, "      0 s ...s", lines[7],
+        "\nsensor 2 (None)", *table, "      0 s ..s.", lines[7],
+        "   0.2000 s  sensor 2: 1 lost: it was polled and gave none",
+        "   0.3000 s  sensor 0: 1 lost: it was polled and gave none",
+    ]  # fmt: skip
 
 
 def test_who_may_not_control_the_server_gets_no_trace() -> None:
