@@ -16,9 +16,11 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 from bota_clients.export.cli import main
 from bota_clients.recording.file_format import frame_topic
 from bota_clients.recording.reader import open_recording
+from tests.bridge.test_one_stream import recorded
 from tests.clients.recordings import describe, frame, record, write
 from tests.clients.running import Replay, frames_in
-from tests.ended import run_here
+from tests.corpus import STREAMS
+from tests.ended import completed, run_here
 from tests.server.running import PATIENCE_S, wait_until
 
 Message = tuple[str, int, int, int, bytes]
@@ -119,3 +121,24 @@ def test_what_it_refuses_leaves_no_file(
     ended = run_here(main, "run.mcap", *arguments)
     assert (ended.code, sentence in ended.err) == (code, True), ended.err
     assert sorted(each.name for each in tmp_path.iterdir()) == ["other.mcap", "run.mcap"]
+
+
+@pytest.mark.parametrize("compression", ["none", "zstd"])
+def test_a_recording_that_rosbags_has_written_again_is_the_same(compression: str, tmp_path: Path) -> None:
+    """Without the recorder's notes, which is said. A process: rosbags has this as a program."""
+    run, folder = recorded(STREAMS["offset_written"], tmp_path / "run.mcap"), tmp_path / "bag"
+    command = ("--src", run, "--dst", folder, "--dst-storage", "mcap", "--compress-mode", "storage")
+    done = completed(sys.executable, "-m", "rosbags.convert", *command, "--compress", compression)
+    assert done.returncode == 0, done.stderr
+    (again,) = folder.glob("*.mcap")
+    assert "has no notes of ethercat-record: another program wrote it" in export(again, tmp_path / "b.csv")
+    export(run, tmp_path / "a.csv")
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+
+
+def test_chunks_of_another_compressor_are_refused_as_what_they_are(tmp_path: Path) -> None:
+    run = recorded(STREAMS["plain"], tmp_path / "run.mcap")
+    run.write_bytes(run.read_bytes().replace(b"\x04\0\0\0zstd", b"\x04\0\0\0lz4f"))
+    ended = run_here(main, run, tmp_path / "a.csv")
+    what = f"{run} is compressed with lz4f, which is not read: write it again with zstd, or none"
+    assert (ended.code, ended.err) == (1, f"ethercat-export: {what}\n")

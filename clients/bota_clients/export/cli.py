@@ -150,6 +150,8 @@ def run(options: argparse.Namespace) -> int:
             if recording.cut_off is not None:
                 how = f"was cut off ({recording.cut_off}): the intact part is exported"
                 say(PROGRAM, f"{recording.path} {how}")
+            if recording.is_rewritten:
+                say(PROGRAM, f"{recording.path} has no notes of ethercat-record: another program wrote it")
             written = write(options, recording)
     except OSError as error:
         raise FileError(f"{options.output} cannot be written: {error.strerror or error}") from None

@@ -32,6 +32,7 @@ from mcap.records import Channel, Chunk, Metadata
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
 from bota_clients.progress import progress
+from bota_ethercat.text.untrusted import printable
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 # Largest chunk in bytes, compressed or not. Those of ethercat-record have some hundred kilobytes.
@@ -273,9 +274,12 @@ class McapFile:
         found = self._parse(Chunk, self._read_at(chunk.offset, chunk.length), chunk.offset)
         size = found.uncompressed_size
         self._bound(chunk.offset, size, MAX_CHUNK)
+        if found.compression not in ("", "zstd"):
+            how = printable(found.compression, 16)
+            raise RecordingError(
+                f"{self.path} is compressed with {how}, which is not read: write it again with zstd, or none"
+            )
         try:
-            if found.compression not in ("", "zstd"):
-                raise ValueError(f"it is compressed with {found.compression[:16]!r}, not zstd")
             if found.compression and zstandard.frame_content_size(found.data) not in (-1, size):
                 raise ValueError("its sizes differ")
             data = self._zstd.decompress(found.data, size) if found.compression else found.data

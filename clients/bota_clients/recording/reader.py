@@ -89,6 +89,7 @@ class Recording(McapFile):
         path: its path.
         cut_off: None if the recording is complete, else a clause that says how it ends.
         metadata: what the recorder wrote at the start, by name (docs/recording.md).
+        is_rewritten: another program has written the frames again, and left that out.
         chosen: positions given with --sensor; empty for all.
         end: what the recorder wrote at the end, None if it was cut off.
         sensors: the sensors that the server described or that have frames, by position.
@@ -98,6 +99,11 @@ class Recording(McapFile):
     def _open(self) -> None:
         super()._open()
         found = self.notes.get(file_format.METADATA)
+        self.is_rewritten = found is None and any(
+            file_format.sensor_of_topic(topic) is not None for topic in self.topics.values()
+        )
+        if self.is_rewritten:
+            found = {"format": file_format.FORMAT_VERSION}
         if found is None:
             raise RecordingError(f"{self.path} is an MCAP file, but ethercat-record did not write it")
         if found.get("format") != file_format.FORMAT_VERSION:
