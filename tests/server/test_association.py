@@ -19,6 +19,7 @@ from ethercat_server.sampling.association import (
     associate_by_polls,
     count_steps,
 )
+from ethercat_server.sampling.phase import SensorPhase
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sampling.sample_clock import SampleClock
 from ethercat_server.sampling.schedule import Schedule, best_margin_ns
@@ -402,3 +403,49 @@ def test_where_polls_are_timed_by_polls_events_are_as_late_as_they_show(late: fl
     assert clock.observe(5_000_000, 5_900_000, None, fresh=True) is (round(late) == 0)
     assert (clock.steps, clock.instant_ns) == (1 + round(late), 5e6)
     assert clock._bias_ns == pytest.approx((late - round(late)) * 1e6 / 64)
+
+
+def known_phase() -> SensorPhase:
+    """Of a sensor that has been followed for long."""
+    phase = SensorPhase(1e6)
+    phase.begin(0.0, 1e5)
+    for _ in range(50):
+        phase.correct(0.0, 1e8)
+        phase.advance(1)
+    return phase
+
+
+def test_four_contradictions_move_the_phase_and_leave_the_period() -> None:
+    """As where the sensor has started anew."""
+    phase = known_phase()
+    begin_ns, period_ns, deviation = phase.phase_ns, phase.period_ns, math.sqrt(phase.period_variance)
+    for number in range(4):
+        assert phase.phase_ns == begin_ns
+        assert math.sqrt(phase.variance) < 10_000
+        phase.learn_instant(begin_ns + 300_000, 1e6)
+        assert (phase.phase_ns == begin_ns) is (number < 3)
+    assert (phase.phase_ns, phase.period_ns) == pytest.approx((begin_ns + 300_000, period_ns), abs=1e-3)
+    assert phase.variance == pytest.approx(1e12 / 12, rel=1e-6)
+    assert deviation < math.sqrt(phase.period_variance) == pytest.approx(2000.0, rel=1e-6)
+    for most in (4000, 8000, 16_000, 30_000, 30_000):
+        for _ in range(4):
+            phase.variance = 1.0
+            phase.learn_instant(phase.phase_ns + 300_000, 1.0)
+        assert math.sqrt(phase.period_variance) == pytest.approx(most, rel=1e-6)
+
+
+def test_a_contradiction_is_forgotten_with_the_next_that_fits() -> None:
+    phase = known_phase()
+    for _ in range(9):
+        for _ in range(3):
+            phase.learn_instant(phase.phase_ns + 300_000, 1e6)
+        phase.learn_instant(phase.phase_ns, 1e6)
+    assert phase.phase_ns == pytest.approx(known_phase().phase_ns)
+
+
+def test_in_holdover_nothing_is_less_known_than_what_is_unknown() -> None:
+    phase = known_phase()
+    phase.advance(10**15)
+    assert math.sqrt(phase.variance) == pytest.approx(1e6 / math.sqrt(12))
+    assert math.sqrt(phase.period_variance) == pytest.approx(0.03e6)
+    assert abs(phase._covariance) <= math.sqrt(phase.variance * phase.period_variance)
