@@ -32,11 +32,13 @@ PERIOD_NS, LEAST_NS = 1_000_000, 50_000
 
 def brought(
     before: float, sent: float, took: float = 50, *, doubt: float = 20, is_doubtful: bool = False,
-    has_events: bool = False, lost_track: bool = False,
+    has_events: bool = False, lost_track: bool = False, was_silent: bool = False,
 ) -> Association:  # fmt: skip
     expected = Expected(0.0, PERIOD_NS, doubt * 1e3, is_doubtful)
     read = Read(round(before * 1e3), round(sent * 1e3), round((sent + took) * 1e3), LEAST_NS)
-    return associate_by_polls(expected, read, has_events=has_events, lost_track=lost_track)
+    return associate_by_polls(
+        expected, read, has_events=has_events, lost_track=lost_track, was_silent=was_silent
+    )
 
 
 @pytest.mark.parametrize(
@@ -60,6 +62,13 @@ def brought(
         pytest.param({"before": -870, "sent": 60, "lost_track": True}, 1, False, id="within a period, too"),
         pytest.param({"before": -900, "sent": 60, "lost_track": True}, 1, True, id="not beyond one"),
         pytest.param({"before": -600, "sent": -550, "has_events": True}, 0, False, id="too early"),
+        pytest.param({"before": 300, "sent": 800}, 2, False, id="nearer to the next but one"),
+        pytest.param({"before": 300, "sent": 800, "has_events": True}, 1, False, id="which cannot be yet"),
+        pytest.param({"before": 300, "sent": 800, "was_silent": True}, 2, True, id="is it? it was silent"),
+        pytest.param(
+            {"before": 300, "sent": 1030, "was_silent": True}, 2, False, id="it is, however silent it was"
+        ),
+        pytest.param({"before": -300, "sent": 60, "was_silent": True}, 1, False, id="the next, certainly"),
     ],
 )
 def test_which_sample_it_is_by_polls(given: dict[str, float], number: int, uncertain: bool) -> None:
