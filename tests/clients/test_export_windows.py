@@ -194,6 +194,19 @@ def tared(path: Path, told: Sequence[Any], steps: Sequence[float]) -> Path:
     return path
 
 
+def test_lost_samples_are_counted_by_the_rate_that_is_in_force() -> None:
+    """It may be known, or another, with the same settings."""
+    made, taken = Windows(100), list[int]()
+    with pytest.raises(RecordingError) as error:
+        made.configure(InForce(SensorInfo(settings=SETTINGS)))
+    assert str(error.value) == "the sampling rate is not known, so lost samples have no place"
+    for number, rate_hz in enumerate((800.0, 400.0, 400.0, 800.0)):
+        made.configure(InForce(SensorInfo(settings=SETTINGS, rate_hz=rate_hz)))
+        made.add(columns([frame(number * 9, flags=int(DataFlag.GAP))]))
+        taken.append(len(made.take(rest=True)))
+    assert taken == [1, 4, 4, 9]
+
+
 @pytest.mark.parametrize("fir", [False, True])
 def test_after_another_filter_no_sample_comes_before_those_that_were_sent_before_it(fir: bool) -> None:
     """It may have been measured before them."""

@@ -144,6 +144,21 @@ def test_a_tare_and_a_reset_forget_the_peaks_and_a_reset_past_warnings(model: Mo
     assert texts(sensor) == (["ADC out of sync"] if tared else [])
 
 
+def test_of_another_sensor_nothing_is_known_of_the_one_before(model: Model) -> None:
+    sensor = take(model, *run(0, 10, **{"force.x": 7.0, "warnings": 8}))
+    assert (sensor.sample is None, sensor.peaks is None, len(sensor.alerts)) == (False, False, 1)
+    made.describe(model, description(), now(10))
+    sensor = only(model, now(10))
+    assert (sensor.sample is None, sensor.peaks is None, len(sensor.alerts)) == (False, False, 1), "the same"
+    other = description()
+    other["sensors"][0]["serial"] += 1
+    made.describe(model, other, now(10))
+    sensor = only(model, now(10))
+    assert (sensor.sample, sensor.peaks, sensor.alerts) == (None, None, ())
+    sensor = take(model, *run(10, 1))
+    assert peaks(sensor)[0] == (0, 0)
+
+
 def test_a_replay_is_told_from_a_server(model: Model) -> None:
     assert model.state(now(0)).server.replay == ""
     made.connect(model, {**description(), "replay": {"files": ["run.mcap"]}}, made.OWN_PEER, now(0))

@@ -408,8 +408,8 @@ def test_only_what_is_around_a_change_of_the_sensors_own_offset_is_left_out(tmp_
 
 def test_before_a_change_that_was_announced_no_sample_is_in_doubt(tmp_path: Path) -> None:
     items: list[Any] = [describe(0, fir=False)]
-    items[0]["sensors"][0]["offset"] = [1.0, 0, 0, 0, 0, 0]
-    for begin, end, offset in ((0, 800, None), (800, 810, [2.0, 0, 0, 0, 0, 0]), (810, 1600, None)):
+    items[0]["sensors"][0]["offset"] = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    for begin, end, offset in ((0, 800, None), (800, 810, [2.0, 4.0, 6.0, 8.0, 1.0, 1.0]), (810, 1600, None)):
         items += [frame(number) for number in range(begin, end)]
         if end < 1600:
             items.append({"event": "offset_changed", "sensor": 0, "offset": offset})
@@ -419,3 +419,24 @@ def test_before_a_change_that_was_announced_no_sample_is_in_doubt(tmp_path: Path
         found = joined([*read])
     assert sorted({*range(1600)} - {*found.sequence.tolist()}) == [*range(800, 813)]
     assert read.said == ["10 frames left out: the sensor's own offset was not known"]
+    as_later = (found.force[[0, -1]].tolist(), found.torque[[0, -1]].tolist())
+    assert as_later == ([[1, 2, 3], [1599, 0, 0]], [[4, -4, -5], [0, 0, 0]])
+
+
+def test_settings_are_in_force_since_they_were_told_first_and_offsets_likewise(tmp_path: Path) -> None:
+    six = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    items: list[Any] = [
+        describe(0),
+        frame(8),
+        {"event": "offset_changed", "sensor": 0, "offset": six},
+        frame(9),
+    ]
+    write(path := tmp_path / "run.mcap", [*items, describe(0, chop=True), frame(10)])
+    with open_recording(path) as recording:
+        (sensor,) = recording.sensors
+    rows = [
+        [((at - START_NS) // PERIOD_NS, now.info.settings.get("chop"), now.info.offset) for at, now in each]
+        for each in (sensor.history, sensor.offsets)
+    ]
+    assert rows[0] == [(0, None, tuple(six)), (9, True, None)]
+    assert rows[1] == [(0, None, None), (8, None, tuple(six)), (9, True, None)]

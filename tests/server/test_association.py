@@ -19,6 +19,7 @@ from ethercat_server.sampling.association import (
     associate_by_polls,
     count_steps,
 )
+from ethercat_server.sampling.phase import SensorPhase
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sampling.sample_clock import SampleClock
 from ethercat_server.sampling.schedule import Schedule, best_margin_ns
@@ -31,11 +32,13 @@ PERIOD_NS, LEAST_NS = 1_000_000, 50_000
 
 def brought(
     before: float, sent: float, took: float = 50, *, doubt: float = 20, is_doubtful: bool = False,
-    has_events: bool = False, lost_track: bool = False,
+    has_events: bool = False, lost_track: bool = False, was_silent: bool = False,
 ) -> Association:  # fmt: skip
     expected = Expected(0.0, PERIOD_NS, doubt * 1e3, is_doubtful)
     read = Read(round(before * 1e3), round(sent * 1e3), round((sent + took) * 1e3), LEAST_NS)
-    return associate_by_polls(expected, read, has_events=has_events, lost_track=lost_track)
+    return associate_by_polls(
+        expected, read, has_events=has_events, lost_track=lost_track, was_silent=was_silent
+    )
 
 
 @pytest.mark.parametrize(
@@ -59,6 +62,13 @@ def brought(
         pytest.param({"before": -870, "sent": 60, "lost_track": True}, 1, False, id="within a period, too"),
         pytest.param({"before": -900, "sent": 60, "lost_track": True}, 1, True, id="not beyond one"),
         pytest.param({"before": -600, "sent": -550, "has_events": True}, 0, False, id="too early"),
+        pytest.param({"before": 300, "sent": 800}, 2, False, id="nearer to the next but one"),
+        pytest.param({"before": 300, "sent": 800, "has_events": True}, 1, False, id="which cannot be yet"),
+        pytest.param({"before": 300, "sent": 800, "was_silent": True}, 2, True, id="is it? it was silent"),
+        pytest.param(
+            {"before": 300, "sent": 1030, "was_silent": True}, 2, False, id="it is, however silent it was"
+        ),
+        pytest.param({"before": -300, "sent": 60, "was_silent": True}, 1, False, id="the next, certainly"),
     ],
 )
 def test_which_sample_it_is_by_polls(given: dict[str, float], number: int, uncertain: bool) -> None:
@@ -402,3 +412,49 @@ def test_where_polls_are_timed_by_polls_events_are_as_late_as_they_show(late: fl
     assert clock.observe(5_000_000, 5_900_000, None, fresh=True) is (round(late) == 0)
     assert (clock.steps, clock.instant_ns) == (1 + round(late), 5e6)
     assert clock._bias_ns == pytest.approx((late - round(late)) * 1e6 / 64)
+
+
+def known_phase() -> SensorPhase:
+    """Of a sensor that has been followed for long."""
+    phase = SensorPhase(1e6)
+    phase.begin(0.0, 1e5)
+    for _ in range(50):
+        phase.correct(0.0, 1e8)
+        phase.advance(1)
+    return phase
+
+
+def test_four_contradictions_move_the_phase_and_leave_the_period() -> None:
+    """As where the sensor has started anew."""
+    phase = known_phase()
+    begin_ns, period_ns, deviation = phase.phase_ns, phase.period_ns, math.sqrt(phase.period_variance)
+    for number in range(4):
+        assert phase.phase_ns == begin_ns
+        assert math.sqrt(phase.variance) < 10_000
+        phase.learn_instant(begin_ns + 300_000, 1e6)
+        assert (phase.phase_ns == begin_ns) is (number < 3)
+    assert (phase.phase_ns, phase.period_ns) == pytest.approx((begin_ns + 300_000, period_ns), abs=1e-3)
+    assert phase.variance == pytest.approx(1e12 / 12, rel=1e-6)
+    assert deviation < math.sqrt(phase.period_variance) == pytest.approx(2000.0, rel=1e-6)
+    for most in (4000, 8000, 16_000, 30_000, 30_000):
+        for _ in range(4):
+            phase.variance = 1.0
+            phase.learn_instant(phase.phase_ns + 300_000, 1.0)
+        assert math.sqrt(phase.period_variance) == pytest.approx(most, rel=1e-6)
+
+
+def test_a_contradiction_is_forgotten_with_the_next_that_fits() -> None:
+    phase = known_phase()
+    for _ in range(9):
+        for _ in range(3):
+            phase.learn_instant(phase.phase_ns + 300_000, 1e6)
+        phase.learn_instant(phase.phase_ns, 1e6)
+    assert phase.phase_ns == pytest.approx(known_phase().phase_ns)
+
+
+def test_in_holdover_nothing_is_less_known_than_what_is_unknown() -> None:
+    phase = known_phase()
+    phase.advance(10**15)
+    assert math.sqrt(phase.variance) == pytest.approx(1e6 / math.sqrt(12))
+    assert math.sqrt(phase.period_variance) == pytest.approx(0.03e6)
+    assert abs(phase._covariance) <= math.sqrt(phase.variance * phase.period_variance)

@@ -473,6 +473,28 @@ def test_a_destination_of_many_networks_is_that_of_a_default_route(
     assert nic._destination(family, length, told) == found
 
 
+@pytest.mark.parametrize("allow_ip", [False, True])
+def test_loopback_is_refused_whatever_is_allowed(allow_ip: bool) -> None:
+    with pytest.raises(InterfaceError) as refused:
+        nic.check_network(nic.Interface("lo", 1, loopback=True), "lo", allow_ip=allow_ip)
+    assert str(refused.value) == "lo is the loopback interface: name the sensor's"
+
+
+def test_where_the_kernel_does_not_say_what_is_on_it_somebody_must_allow_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def unknown(_: int) -> Routes:
+        raise OSError("no answer")
+
+    monkeypatch.setattr(nic, "find_routes", unknown)
+    nic.check_network(SEES, "near0", allow_ip=True)
+    with pytest.raises(InterfaceError) as refused:
+        nic.check_network(SEES, "near0", allow_ip=False)
+    assert str(refused.value) == (
+        "the kernel does not say whether near0 has an IP address (no answer): --allow-ip overrides this check"
+    )
+
+
 def test_what_a_name_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(nic, "own_name", lambda name: {"alternative/name": "ens5"}.get(name, name))
     for name, is_one in (

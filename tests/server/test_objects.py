@@ -298,6 +298,21 @@ def test_each_request_is_done_once_whatever_counter_another_master_left(
     assert set(slave.counters) == set(range(2, 8)), "SOEM's mapping begins with 1, where the bus comes up"
 
 
+def test_one_transfer_waits_for_the_other() -> None:
+    slave, read = CountingSlave(0.01, 0.01), list[int]()
+    sdo = MailboxSdo(cast(Bus, slave), 0, MAILBOXES)
+    under_way = [sdo.read(0x8001, 1), sdo.read(0x8002, 1), sdo.read(0x8003, 1)]
+    while under_way:
+        for steps in [*under_way]:
+            try:
+                next(steps)
+            except StopIteration as ended:
+                read.append(int.from_bytes(ended.value, "little"))
+                under_way.remove(steps)
+        slave.clock.sleep(0.001)
+    assert (read, len(slave.counters)) == ([2, 3, 4], 4), "after one probe"
+
+
 def test_a_lost_datagram_does_not_have_a_write_done_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     """By a slow slave, whose answer is still to come."""
     slave, lost = CountingSlave(0.0, 0.03), [True]

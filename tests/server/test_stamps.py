@@ -316,3 +316,20 @@ def test_an_instant_is_converted_by_the_clocks_of_now() -> None:
     for _ in range(3):
         clock.now_ns += 10**9
         assert clocks.monotonic_ns(clock.now_ns) == pytest.approx(clock.monotonic_ns(), abs=2)
+
+
+@pytest.mark.parametrize("set_ns", [0, 400, 10**6, -(10**6), 3600 * 10**9, -3600 * 10**9])
+def test_only_a_wall_clock_that_was_set_has_another_difference(set_ns: int) -> None:
+    """However long reading it is held up; nobody can tell less than what lies between two reads."""
+    clock: Any = HeldUp()
+    monotonic_ns, set_by = clock.monotonic_ns, [0]
+    clock.time_ns = lambda: monotonic_ns() + 10**18 + set_by[0]
+    clocks = StampClocks(clock)
+    before_ns = clocks.realtime_ns
+    assert before_ns == pytest.approx(10**18, abs=1)
+    set_by[0] = set_ns
+    clock.holds_ns = lambda: 300 if set_ns else 5 * 10**8
+    for _ in range(3):
+        clocks.follow_realtime()
+        expected = before_ns + (set_ns if abs(set_ns) > 10**5 else 0)
+        assert clocks.realtime_ns == pytest.approx(expected, abs=1000 if set_ns else 0)

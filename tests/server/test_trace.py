@@ -18,7 +18,7 @@ from ethercat_server.daemon.loss_traces import LossTraces
 from ethercat_server.doctor.cli import main as doctor
 from ethercat_server.doctor.trace import find_losses, show
 from ethercat_server.sampling.replay import Decision, Record, Trace, TraceError
-from ethercat_server.sampling.trace import RECORD, Clocks, RecordKind, Ring
+from ethercat_server.sampling.trace import RECORD, Clocks, RecordKind, Ring, learn_note
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.simulation.server import MemoryChannel
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -104,6 +104,13 @@ def test_the_ring_has_the_last_minute_and_is_read_while_it_goes_on() -> None:
     seconds = (trace.records[-1].sent_ns - trace.records[0].sent_ns) * 1e-9
     assert 40 < seconds <= 100
     check_replay(simulation)
+
+
+@pytest.mark.parametrize(("late_ns", "told"), [(None, 0), (-5.0, 1), (0.0, 1), (7.4, 8), (1e12, 0xFFFFFFFF)])
+def test_that_it_had_not_slept_is_not_that_it_woke_in_time(late_ns: float | None, told: int) -> None:
+    exchange = (1000, 9000, b"", 3, 0)
+    note = learn_note(exchange, 4000, RecordKind.LEARNED, late_ns)
+    assert note == (exchange, (3000, 0, told, 0), 0, RecordKind.LEARNED)
 
 
 def test_what_the_ring_has_lost_meanwhile_is_zeros() -> None:
