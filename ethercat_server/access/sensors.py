@@ -20,7 +20,7 @@ from bota_ethercat.errors import (
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.program.server_choice import default_server, is_address
 from bota_ethercat.program.signals import signals_call, signals_held_back
-from bota_ethercat.replies import Description, Status
+from bota_ethercat.replies import Description, SensorInfo, Status
 from bota_ethercat.sensor_choice import SensorChoice
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.text.json_text import JsonObject
@@ -153,20 +153,21 @@ class Sensors:
                 waits = "waiting for its result; Ctrl-C again leaves without it"
                 note(f"{self._name} continues the tare: {waits}")
 
+        before = self.describe().find(number)
         with signals_call(interrupt):
             try:
                 return self.ask("tare", timeout_s, sensor=number, samples=samples, target=list(target))
             except BusError as error:
                 if self.private is None or not str(error).endswith(LATER):
                     raise
-                raise BusError(f"{str(error).removesuffix(LATER)}{self._wait_back(number)}") from None
+                raise BusError(f"{str(error).removesuffix(LATER)}{self._wait_back(number, before)}") from None
 
-    def _wait_back(self, number: int) -> str:
+    def _wait_back(self, number: int, before: SensorInfo | None) -> str:
         """Give a sensor that was lost in a tare the time to come back; what became of its offset."""
         deadline = Deadline(self.clock, _BACK_S)
         while (info := self.describe().find(number)) is None or info.state != "OP":
             if deadline.passed:
-                old = " ".join(f"{value:g}" for value in (info and info.offset) or ())
+                old = " ".join(f"{value:g}" for value in (before and before.offset) or ())
                 return f"; its offset may be half written (it was {old}): tare it again"
             self.clock.sleep(_IDLE_S)
         return "; it is back with its old offset"

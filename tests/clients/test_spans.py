@@ -228,7 +228,8 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path, program: Callable[
         program(path)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peaks[1] < peaks[0] + (4 << 20)  # as of buffers that were not full; samples would take 30 MB
+    # More by buffers that were not full; the samples would take 30 MB.
+    assert peaks[1] < max(1.1 * peaks[0], peaks[0] + (4 << 20))
 
 
 @pytest.mark.parametrize(

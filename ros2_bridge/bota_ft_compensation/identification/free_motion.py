@@ -96,7 +96,7 @@ def _imu_covariance() -> Array:
     turned[12:21].reshape(3, 3, 3)[~np.eye(3, dtype=bool)] = CHIP_TURN * OF_TURN
     found = np.diag([*[0.0] * 12, *gyroscope.ravel() ** 2, *[_OFF_PLACE**2] * 3]) + turned @ turned.T
     found[:12, :12] = np.linalg.inv(FULL_CALIBRATION)
-    return found
+    return np.asarray(found)
 
 
 _IMU: Final = np.linalg.inv(_imu_covariance())
