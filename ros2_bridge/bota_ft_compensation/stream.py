@@ -137,9 +137,11 @@ class CompensatedStream:
 
     def check(self) -> None:
         """Find out what holds up the samples that follow; after a change of the plan, or of what forbids."""
-        has_tool, by_imu = self.plan.has_tool, self.plan.source.is_imu
-        why = self.forbidden or obstacle(self.in_force.info.settings, has_tool=has_tool, by_imu=by_imu)
-        self.hold = why or self.own_offset.doubt(self.offset)
+        found: object = None
+        while found is not (found := self.in_force):  # another thread may have changed it meanwhile
+            has_tool, by_imu = self.plan.has_tool, self.plan.source.is_imu
+            why = self.forbidden or obstacle(self.in_force.info.settings, has_tool=has_tool, by_imu=by_imu)
+            self.hold = why or self.own_offset.doubt(self.offset)
 
     def feel(self, sample: Sample, time_s: float, stamp_s: float, *, always: bool = False) -> Vector3 | None:
         """The specific force at the tool in this sample, m/s²; None if it is not known.
