@@ -412,6 +412,7 @@ def test_what_is_known_of_the_server_is_that_of_its_last_connection() -> None:
     assert model.state(26.0).clients == ()
     made.connect(model, {**description(), "replay": {}}, made.OWN_PEER, 30.0)
     assert model.state(30.0).server.replay == "a recording"
+    assert known(30.0) == (True, "", 0.0, 0.0, None, False)
 
 
 CLIENTS = (("a", 5, 0), ("b", 9, 0), ("c", 1, 7), (made.OWN_PEER, 0, 0))

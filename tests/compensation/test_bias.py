@@ -368,7 +368,8 @@ def test_why_there_is_no_specific_force() -> None:
     off, fast = sample(acceleration=ZERO), sample(acceleration=(math.nan, 0.0, 9.8))
     assert (source.why_none(sample(), 0.0), source.why_none(off, 0.0)) == ("", IMU_IS_OFF)
     assert source.why_none(fast, 0.0) == "the IMU sends NaN or infinity: see the status stream"
-    assert source.specific_force(sample(), 1.0, 0.0) == source.felt
+    moved = sample(acceleration=(1.0, 2.0, 9.0))
+    assert source.specific_force(moved, 1.0, 0.0) == source.felt == pytest.approx((1.0, 2.0, 9.0))
     felt_before = source.felt
     assert source.specific_force(off, 1.01, 0.0) is None
     assert source.felt == felt_before, "of the latest sample in which something was felt"

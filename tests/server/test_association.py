@@ -441,6 +441,11 @@ def test_four_contradictions_move_the_phase_and_leave_the_period() -> None:
             phase.variance = 1.0
             phase.learn_instant(phase.phase_ns + 300_000, 1.0)
         assert math.sqrt(phase.period_variance) == pytest.approx(most, rel=1e-6)
+    phase.period_variance = 1e9
+    for _ in range(4):
+        phase.variance = 1.0
+        phase.learn_instant(phase.phase_ns + 300_000, 1.0)
+    assert phase.period_variance == 1e9, "what is known less already"
 
 
 def test_a_contradiction_is_forgotten_with_the_next_that_fits() -> None:

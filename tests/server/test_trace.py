@@ -322,6 +322,21 @@ def test_a_trace_is_shown_line_by_line(tmp_path: Path, monkeypatch: pytest.Monke
     assert (len(lines), lines[-1]) == (31, "(2 more)")
 
 
+@pytest.mark.parametrize(("losses", "last"), [(20, "20 lost: it was"), (21, "(1 more)")])
+def test_of_many_losses_the_first_are_shown(
+    losses: int, last: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = [
+        Decision(Record(at, 10**5, 0, 0, 0, RecordKind.FRESH, False, 3), at, number, False, True, True)
+        for number in range(1, losses + 2)
+        for at in [10**9 + number * 10**7]
+    ]
+    made = SimpleNamespace(about={}, records=steps, replay=lambda: iter(steps))
+    monkeypatch.setattr("ethercat_server.doctor.trace.Trace", lambda _: made)
+    (path := tmp_path / "a.trace").write_bytes(b"")
+    assert last in [*show(path)][-1]
+
+
 def test_sensors_are_shown_one_by_one_and_their_losses_in_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
