@@ -37,7 +37,7 @@ def live(stream: Stream, stamps: list[int], tool: Path, late_ns: int) -> list[Ar
     """The windows of these instants, asked for as soon as they are complete, or so much later."""
     server, found = MemoryServer(), list[Arrays]()
     server.description = stream.begin
-    with Client(1, channel=ScriptedChannel(server)) as client:
+    with Client(1, raw=late_ns > 0, channel=ScriptedChannel(server)) as client:
         client.connect()
         windows = LiveWindows(client, LENGTH, tool=tool, keep_s=3.0)
 

@@ -117,7 +117,7 @@ class LiveWindows:
             self._clocks = np.hstack([self._clocks, (new.stamp_ns, new.monotonic_ns)])
         self._shift_ns = self._axis.shift_ns
         oldest_ns = self._windows.until_ns - self._keep_ns
-        if self._clocks[1, 0] > oldest_ns - self._keep_ns // 2:
+        if not self._clocks.size or self._clocks[1, 0] > oldest_ns - self._keep_ns // 2:
             return  # now and then is enough
         self._windows.forget(oldest_ns)
         kept = max(int(np.searchsorted(self._clocks[1], oldest_ns)) - 1, 0)
