@@ -84,6 +84,7 @@ class Windows:
         self._length, self.imu_units = length, imu_units
         self.stream: CompensatedStream | None = None
         self._slots = np.zeros(0, _SLOT)
+        self._until_ns = np.full(3, -1)  # by channel: the latest measured
         self._newest = (0, 0)  # stamp and sequence of the newest sample
         self._taken = self._epoch = 0  # samples; of what is in force
         self._begins = False  # another stream, which the first sample after a pause need not say
@@ -130,7 +131,7 @@ class Windows:
     @property
     def until_ns(self) -> int:
         """The last instant of which nothing that comes later can be a part; -1 before the first sample."""
-        return int(self._slots["measured_ns"].max(axis=0, initial=-1).min())
+        return int(self._until_ns.min())
 
     def add(self, frames: Columns) -> Columns:
         """Take the next frames of the sensor, also REPEATED and INVALID ones; the samples. RecordingError."""
@@ -174,6 +175,7 @@ class Windows:
         slots["compensated"][at], slots["bounds"][at] = (
             (math.nan, math.nan) if self.stream is None else self.stream.compensate(samples)
         )
+        self._until_ns = np.maximum(self._until_ns, slots["measured_ns"].max(axis=0))
         self._slots = np.concatenate([self._slots, slots])
         return samples
 
