@@ -8,11 +8,8 @@ not finite. Covariances are 0, unknown (REP 145).
 from __future__ import annotations
 
 import argparse
-import contextlib
 import struct
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 from typing import IO, Any, Final, NamedTuple, cast
 
 import numpy as np
@@ -26,8 +23,7 @@ from bota_clients.export.windows import Arrays
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.reader import Recording
-from bota_clients.recording.writer import DiskFile
-from bota_ethercat.program.new_file import refuse_existing
+from bota_clients.recording.writer import whole_file
 from bota_ethercat.program.version import VERSION
 
 _STORE: Final[Any] = get_typestore(Stores.ROS2_JAZZY)
@@ -86,24 +82,18 @@ _NUMBERS: Final = {_WRENCH: 6, _IMU: 37}  # float64 at the end; of others 2
 
 def write(options: argparse.Namespace, recording: Recording) -> str:
     """The topics of a sensor into a file; says how many messages. RecordingError."""
-    path, sensor = options.output, choose(recording, options.sensor)
+    sensor = choose(recording, options.sensor)
     windows = windows_for(options, recording, sensor, MOST_LOST)
-    refuse_existing(path, force=options.force)
-    with tempfile.TemporaryDirectory(
-        prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
-    ) as folder:
-        made = Path(folder, path.name)
-        with contextlib.closing(DiskFile(made, overwrite=False)) as disk:
-            writer: Any = Writer(cast("IO[Any]", disk), compression=CompressionType.ZSTD)
-            writer.start("ros2", f"{PROGRAM} {VERSION}")
-            wanted = [topic for topic in TOPICS if windows.stream or not topic.valid]
-            senders, sent = [_Sender(writer, topic) for topic in wanted], 0
-            for block in samples_of(recording, windows, sensor.sensor):
-                sent += sum(each.send(block) for each in senders)
-                disk.flush()
-            writer.finish()
+    with whole_file(options.output, force=options.force) as disk:
+        writer: Any = Writer(cast("IO[Any]", disk), compression=CompressionType.ZSTD)
+        writer.start("ros2", f"{PROGRAM} {VERSION}")
+        wanted = [topic for topic in TOPICS if windows.stream or not topic.valid]
+        senders, sent = [_Sender(writer, topic) for topic in wanted], 0
+        for block in samples_of(recording, windows, sensor.sensor):
+            sent += sum(each.send(block) for each in senders)
             disk.flush()
-        made.replace(path)
+        writer.finish()
+        disk.flush()
     return f"{count(sent, 'message')} on {', '.join(topic.name for topic in wanted)}"
 
 

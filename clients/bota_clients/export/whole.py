@@ -7,9 +7,6 @@ killed does not write.
 from __future__ import annotations
 
 import argparse
-import contextlib
-import tempfile
-from pathlib import Path
 from typing import Final
 
 from bota_clients.errors import RecordingError
@@ -17,8 +14,7 @@ from bota_clients.export.cli import PROGRAM
 from bota_clients.numbers import count
 from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
 from bota_clients.recording.reader import Recording
-from bota_clients.recording.writer import DiskFile, RecordingWriter
-from bota_ethercat.program.new_file import refuse_existing
+from bota_clients.recording.writer import RecordingWriter, whole_file
 from bota_ethercat.program.version import VERSION
 
 _CHUNK: Final = 1024  # messages
@@ -29,29 +25,23 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
 
     A recording that was cut off has no notes at its end here either; `repaired` at its start says why.
     """
-    path, sensor, notes = options.output, options.sensor, dict(recording.metadata)
+    sensor, notes = options.sensor, dict(recording.metadata)
     if sensor is not None:
         if sensor not in {each.sensor for each in recording.sensors if each.frames}:
             raise RecordingError(f"{recording.path} has no samples of sensor {sensor}")
         notes["sensors"] = str(sensor)
     if recording.cut_off is not None:
         notes["repaired"] = recording.cut_off
-    refuse_existing(path, force=options.force)
-    with tempfile.TemporaryDirectory(
-        prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
-    ) as folder:
-        made = Path(folder, path.name)
-        with contextlib.closing(DiskFile(made, overwrite=False)) as disk:
-            writer = RecordingWriter(disk, f"{PROGRAM} {VERSION}", notes)
-            for number, item in enumerate(recording.everything(sensor)):
-                if isinstance(item, RecordedDescription):
-                    writer.describe(item.stamp_ns, item.reply)
-                elif isinstance(item, RecordedEvent):
-                    writer.event(item.stamp_ns, item.event)
-                else:
-                    writer.frame(item)
-                if number % _CHUNK == _CHUNK - 1:
-                    writer.flush()
-            writer.finish(recording.end)
-        made.replace(path)
+    with whole_file(options.output, force=options.force) as disk:
+        writer = RecordingWriter(disk, f"{PROGRAM} {VERSION}", notes)
+        for number, item in enumerate(recording.everything(sensor)):
+            if isinstance(item, RecordedDescription):
+                writer.describe(item.stamp_ns, item.reply)
+            elif isinstance(item, RecordedEvent):
+                writer.event(item.stamp_ns, item.event)
+            else:
+                writer.frame(item)
+            if number % _CHUNK == _CHUNK - 1:
+                writer.flush()
+        writer.finish(recording.end)
     return count(writer.frames, "frame")

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, Final, cast
 
@@ -17,7 +18,7 @@ from mcap.writer import CompressionType, Writer
 from bota_clients.errors import RecordingError
 from bota_clients.recording import file_format
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.program.new_file import EXISTS, where_supported
+from bota_ethercat.program.new_file import EXISTS, refuse_existing, where_supported
 from bota_ethercat.text.json_text import JsonObject
 
 try:
@@ -115,6 +116,19 @@ class DiskFile:
 
     def _failed(self, error: OSError, more: str = "") -> RecordingError:
         return RecordingError(f"{self.path} cannot be written: {error.strerror}{more}")
+
+
+@contextlib.contextmanager
+def whole_file(path: Path, *, force: bool) -> Iterator[DiskFile]:
+    """A file that is there once it is complete; FileError if it exists and `force` is False."""
+    refuse_existing(path, force=force)
+    with tempfile.TemporaryDirectory(
+        prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
+    ) as folder:
+        made = Path(folder, path.name)
+        with contextlib.closing(DiskFile(made, overwrite=False)) as disk:
+            yield disk
+        made.replace(path)
 
 
 class RecordingWriter:
