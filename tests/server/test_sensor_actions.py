@@ -515,6 +515,17 @@ def test_a_change_of_the_offset_is_told_at_once(bench: Bench) -> None:
     assert told() == bench.described()["offset"] == changed
 
 
+def test_a_refused_offset_is_refused_for_its_own_reason(bench: Bench) -> None:
+    """Also where it cannot be read back: then it is not known, until it is written."""
+    bench.command("abort 0x8000 2 0x06010000")
+    bench.command("abort 0x8000 1 0x08000021")
+    refused = bench.refused("sdo_write", index=OFFSET, subindex=2, type="f32", value=1.5)
+    assert (refused["code"], refused["abort_code"]) == ("sensor", 0x06010000)
+    assert bench.described()["offset"] is None
+    assert bench.ask("sdo_write", index=OFFSET, subindex=2, type="f32", value=2.5)["ok"]
+    assert bench.described()["offset"] == [0.0, 2.5, 0.0, 0.0, 0.0, 0.0]
+
+
 def test_a_tare_has_the_time_that_its_samples_take() -> None:
     """At the lowest rate, too."""
     bench = Bench(settings={"sinc_length": 2048})

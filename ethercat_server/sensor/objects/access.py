@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
@@ -95,7 +96,8 @@ def write(
         raise extended(error, "; whether it took the value is not known") from None
     except BusError:
         if is_offset:
-            yield from _read_offset(sdo, sensor, on_offset)
+            with contextlib.suppress(BusError):  # the first error is the one to be told
+                yield from _read_offset(sdo, sensor, on_offset)
         raise
     entry = dictionary.BY_ADDRESS.get((index, subindex))
     if entry is not None and entry.setting is not None:
