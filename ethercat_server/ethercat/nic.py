@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import fcntl
+import functools
 import ipaddress
 import os
 import socket
@@ -19,7 +20,7 @@ import struct
 import sys
 import time
 from array import array
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -406,7 +407,7 @@ class Routes(NamedTuple):
 def find_routes(index: int) -> Routes:
     """What is on the interface now; OSError if the kernel does not say."""
     try:
-        carried = _carried_by(index)
+        carried, objects = _carried_by(index), functools.cache(_next_hop_objects)
         addresses = [
             (f"{ipaddress.ip_address(found.get(_IFA_LOCAL) or found[_IFA_ADDRESS])}/{length}", scope, flags)
             for (family, length, flags, scope, its), found in _ask(_GET_ADDRESS, _ADDRESS, *(0,) * 5)
@@ -418,7 +419,7 @@ def find_routes(index: int) -> Routes:
                 _GET_ROUTE, _ROUTE, *(0,) * 9
             )
             if family in _FAMILIES and kind == _UNICAST and not flags & _CACHED
-            for index, gateway in _hops(found)
+            for index, gateway in _hops(found, objects)
             if index in carried
         ]
     except (LookupError, ValueError, struct.error) as error:
@@ -454,8 +455,18 @@ def _carried_by(index: int) -> set[int]:
     return carried
 
 
-def _hops(route: dict[int, bytes]) -> Iterator[tuple[int, bool]]:
-    """Of each next hop of a route the interface, and whether there is a gateway."""
+def _next_hop_objects() -> dict[bytes, dict[int, bytes]]:
+    """By number."""
+    return {found[_NHA_ID]: found for _, found in _ask(_GET_NEXT_HOP, _OBJECT, *(0,) * 4)}
+
+
+def _hops(
+    route: dict[int, bytes], objects: Callable[[], dict[bytes, dict[int, bytes]]]
+) -> Iterator[tuple[int, bool]]:
+    """Of each next hop of a route the interface, and whether there is a gateway.
+
+    `objects` gives those to which a route may refer; there may be many such routes.
+    """
     if _RTA_OIF in route:
         yield int.from_bytes(route[_RTA_OIF], sys.byteorder), not _RTA_GATEWAYS.isdisjoint(route)
     hops = route.get(_RTA_MULTIPATH, b"")
@@ -464,10 +475,10 @@ def _hops(route: dict[int, bytes]) -> Iterator[tuple[int, bool]]:
         yield index, not _RTA_GATEWAYS.isdisjoint(_attributes(hops[_NEXT_HOP.size : size]))
         hops = hops[max(_NEXT_HOP.size, size + 3 & ~3) :]
     if _RTA_NEXT_HOP in route and not {_RTA_OIF, _RTA_MULTIPATH} & route.keys():
-        objects = {found[_NHA_ID]: found for _, found in _ask(_GET_NEXT_HOP, _OBJECT, *(0,) * 4)}
-        named = objects[route[_RTA_NEXT_HOP]]
+        there = objects()
+        named = there[route[_RTA_NEXT_HOP]]
         group = named.get(_NHA_GROUP, b"")
-        members = [objects[group[at : at + 4]] for at in range(0, len(group), _MEMBER.size)]
+        members = [there[group[at : at + 4]] for at in range(0, len(group), _MEMBER.size)]
         for each in members or [named]:
             yield int.from_bytes(each.get(_NHA_OIF, b""), sys.byteorder), _NHA_GATEWAY in each
 
