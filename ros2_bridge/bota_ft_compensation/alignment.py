@@ -34,7 +34,6 @@ _UNKNOWN_HZ: Final = 1600.0  # taken for a rate that is unknown: samples that ar
 _HISTORY_S: Final = 0.014, 0.025  # of acceleration and angular rate: what precedes it tells hardly more
 # Motion that is expected beyond a line: rms, m/s² and rad/s, Hz up to which its density is about constant,
 # and how steeply it falls. Chosen by what is left of moves, polishing and vibration; the optimum is flat.
-_Motion = tuple[float, float, int]
 _ACCELERATION, _RATE = (10.0, 9.0, 3), (6.0, 8.0, 8)
 _HERTZ: Final = 0.5 * 2.0 ** (np.arange(21) / 2)
 # Extrapolation goes no further, though slow filters of the IMU ask for up to 65 ms: its noise grows with it.

@@ -14,8 +14,11 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader, AnyReaderError
 
 from bota_clients.export.cli import main
+from bota_clients.identify.cli import main as identify
 from bota_clients.recording.file_format import frame_topic
-from bota_clients.recording.reader import open_recording
+from bota_clients.recording.reader import REWRITTEN, open_recording
+from bota_clients.report.series import of_recording
+from bota_ethercat.pdo import ImuUnits
 from tests.bridge.test_one_stream import recorded
 from tests.clients.recordings import describe, frame, record, write
 from tests.clients.running import Replay, frames_in
@@ -131,7 +134,9 @@ def test_a_recording_that_rosbags_has_written_again_is_the_same(compression: str
     done = completed(sys.executable, "-m", "rosbags.convert", *command, "--compress", compression)
     assert done.returncode == 0, done.stderr
     (again,) = folder.glob("*.mcap")
-    assert "has no notes of ethercat-record: another program wrote it" in export(again, tmp_path / "b.csv")
+    assert f"{again} {REWRITTEN}" in export(again, tmp_path / "b.csv")
+    assert f"{again} {REWRITTEN}" in run_here(identify, again).err
+    assert f"The recording {REWRITTEN}." in of_recording(again, ImuUnits.G_DPS)[0].remarks
     export(run, tmp_path / "a.csv")
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
 

@@ -139,7 +139,7 @@ def run(options: argparse.Namespace) -> int:
 
     Ctrl-C ends it at any time and leaves no file.
     """
-    from bota_clients.recording.reader import open_recording  # noqa: PLC0415 - needs the extra
+    from bota_clients.recording.reader import REWRITTEN, open_recording  # noqa: PLC0415 - needs the extra
 
     module = "dataset" if options.suffix in DATASETS else "csv_table"
     module = "whole" if options.mcap else "ros_topics" if options.ros else module
@@ -151,7 +151,7 @@ def run(options: argparse.Namespace) -> int:
                 how = f"was cut off ({recording.cut_off}): the intact part is exported"
                 say(PROGRAM, f"{recording.path} {how}")
             if recording.is_rewritten:
-                say(PROGRAM, f"{recording.path} has no notes of ethercat-record: another program wrote it")
+                say(PROGRAM, f"{recording.path} {REWRITTEN}")
             written = write(options, recording)
     except OSError as error:
         raise FileError(f"{options.output} cannot be written: {error.strerror or error}") from None

@@ -1,7 +1,7 @@
 """The last samples that were measured before an instant: of a recording, or of a stream with the same result.
 
     windows = Windows(32)
-    windows.configure(row["settings"], row["rate_hz"], row["name"], row["offset"])  # whenever they change
+    windows.configure(in_force)  # of the timeline, whenever it changes
     windows.add(columns(frames))  # DATA messages of one sensor, in order
     arrays = windows.at(np.array([windows.until_ns]))
 
@@ -30,14 +30,11 @@ from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.stream.timeline import InForce
 from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE
 from bota_ft_compensation.identification.parameter_file import stream_of
-from bota_ft_compensation.stream import (
-    CompensatedStream,
-)
+from bota_ft_compensation.stream import CompensatedStream
 
 Array = npt.NDArray[Any]
 Arrays = dict[str, Array]
 _CHANNELS: Final = {FORCE_TORQUE: slice(0, 6), ACCELERATION: slice(6, 9), ANGULAR_RATE: slice(9, 12)}
-_UNKNOWN: Final = (math.nan,) * 3
 _SLOT: Final = np.dtype([
     ("measured_ns", "i8", 3),  # by channel; of an empty slot by its place between two samples
     ("values", "f4", 12),  # force, torque, acceleration, angular rate: N, Nm, m/s², rad/s; NaN: empty

@@ -25,7 +25,7 @@ from bota_clients.identify.tool_file import write_bota
 from bota_clients.program import say
 from bota_clients.recording.columns import Columns, Floats
 from bota_clients.recording.order import AtLastOffset
-from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
+from bota_clients.recording.reader import REWRITTEN, RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.program.new_file import refuse_existing
 from bota_ft_compensation.alignment import align
@@ -199,6 +199,8 @@ def run(options: argparse.Namespace) -> int:
         sensor = choose(recording, options.sensor)
         if recording.cut_off is not None:
             _say(f"{options.path} was cut off ({recording.cut_off}): the intact part is used")
+        if recording.is_rewritten:
+            _say(f"{options.path} {REWRITTEN}")
         for row in sensor.history:
             if why := obstacle(row.info.settings, has_tool=True, by_imu=True):
                 raise RecordingError(f"{options.path} does not show a tool: {why}; and record again")

@@ -32,6 +32,7 @@ from bota_ethercat.stream.timeline import InForce, Timeline
 _MAX_NOTES: Final = 1_000_000  # descriptions and events
 _BATCH: Final = 4096  # frames
 _NOTE: Final = file_format.MAX_SENSOR + 1
+REWRITTEN: Final = "has no notes of ethercat-record: another program wrote it"
 _LONGEST_CHOICE: Final = 1024  # characters of the list of chosen positions
 
 

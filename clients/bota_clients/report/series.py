@@ -18,7 +18,7 @@ import numpy as np
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count, listing, moment
 from bota_clients.recording.columns import Bools, Columns, Floats, Ints
-from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
+from bota_clients.recording.reader import REWRITTEN, RecordedSensor, Recording, open_recording
 from bota_ethercat.accounting import StreamAccounting
 from bota_ethercat.health.limits import LIMITS
 from bota_ethercat.pdo import ImuUnits
@@ -81,6 +81,8 @@ def of_recording(path: Path, imu_units: ImuUnits) -> list[Subject]:
         if not recorded:
             raise RecordingError(f"{path} has no sensor")
         remarks = [f"The recording was cut off: {recording.cut_off}."] if recording.cut_off else []
+        if recording.is_rewritten:
+            remarks.append(f"The recording {REWRITTEN}.")
         if others := [str(sensor.sensor) for sensor in recording.sensors if sensor not in recorded]:
             remarks.append(f"Not recorded, because others were chosen: sensor {listing(others)}.")
         remarks += _event_remarks(event.name for event in recording.events)
@@ -240,7 +242,7 @@ BINS: Final = 640  # of the plots: about the width of a page in points
 DENSE: Final = 2 * BINS  # more samples than this are drawn as an envelope
 
 
-class Distribution:
+class Histogram:
     """How often each whole number came; many different ones in coarser steps, so that memory is bounded."""
 
     def __init__(self) -> None:
@@ -343,13 +345,13 @@ class Series:
         self.saturated = np.zeros((BINS, len(CHANNELS)), bool)
         self.lossy = np.zeros(BINS, bool)
         self.few = list[tuple[float, Floats, bool]]()  # up to DENSE samples: time, values, is it apart
-        self._unbroken, self._gravity = Distribution(), Distribution()
+        self._unbroken, self._gravity = Histogram(), Histogram()
         self._kept_ns = self._kept_periods = 0
         self._before: tuple[int, int, int] | None = None  # monotonic and stamp of the latest sample, missing
         self._since = 0  # other frames since it
 
     def _measure_time(self) -> None:
-        intervals, first, last = Distribution(), None, -1
+        intervals, first, last = Histogram(), None, -1
         self.frames = self.count = self._begin_ns = 0  # frames, samples, stamp of the first frame
         self.stamps: tuple[int, int] | None = None  # of the first and the last frame
         ends = list[int]()

@@ -34,15 +34,11 @@ _WINDOW_S: Final = 0.05  # of the smoothing; a quarter of it apart are the insta
 _PIECE_S: Final = 0.5  # whose residuals are independent of those of the others
 _CONTACT_N, _CONTACT_SHARE = 1.0, 0.05  # contact: so much force, and of the weight, is not explained
 _AROUND_S: Final = 0.2  # left out before and after a contact
-_LEAST_PIECES: Final = 4
 # rad/s², rms of a piece: less is mostly noise of the gyroscope, which would pass for motion.
 _LEAST_SPIN: Final = 0.3
 # m/s²; how far from 1, also in standard errors: of a healthy IMU in motion.
 _GRAVITY, _GAIN, _CHANCE = (7.0, 13.0), 0.35, 4.0
 _CHANGES: Final = 1.0  # m/s³, rms: with less an offset of the gyroscope would be most of the turning
-_LEAST_CENTER: Final = 5e-4  # m: how well poses tell the center of gravity of what moves, at best
-_GYROSCOPE: Final = 0.01  # tolerance of its sensitivity, 95 %
-_HARDLY: Final = 0.5  # of the interval before: a moment no better known than so is not determined
 _AT_FIRST: Final = 1e6  # weights: what is measured goes first, not what was known before
 PLACES: Final = [("xyz".index(row), "xyz".index(column)) for row, column in ELEMENTS]
 
