@@ -12,7 +12,7 @@ from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.stream.timeline import InForce
-from bota_ft_compensation.alignment import Alignment, align
+from bota_ft_compensation.alignment import align
 from bota_ft_compensation.quantities import (
     EXACT,
     IDENTITY,
@@ -98,24 +98,17 @@ class ImuSource(Source):
         (x, y, z), (cx, cy, cz) = imu_position(name, self._position), self._center
         return cx - x, cy - y, cz - z
 
-    @property
-    def alignment(self) -> Alignment:
-        """By the settings that are in force."""
-        return self._imu.alignment
-
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
-        found = self._imu.follow(sample.acceleration, sample.angular_rate, time_s)
-        self.turning = self._imu.turning
-        if found is None or not any(sample.acceleration):
-            return None
-        self.felt = found
-        return found
+        return self.follow(sample.acceleration, sample.angular_rate, time_s)
 
     def follow(self, acceleration: Vector3, angular_rate: Vector3, time_s: float) -> Vector3 | None:
         """As `specific_force`, of a sample's m/s² and rad/s."""
         found = self._imu.follow(acceleration, angular_rate, time_s)
         self.turning = self._imu.turning
-        return found if any(acceleration) else None
+        if found is None or not any(acceleration):
+            return None
+        self.felt = found
+        return found
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         if not any(sample.acceleration):

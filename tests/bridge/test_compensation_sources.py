@@ -309,7 +309,7 @@ def test_the_imu_is_delayed_as_the_filters_that_are_set_delay_force_and_torque()
     assert felt() == 22.0, "how long CHOP delays is not known"
     for rate_hz in (100, 50):
         source.configure(InForce(SensorInfo(settings=known, rate_hz=rate_hz)))
-    assert source.alignment.period_s == 0.02, "the same filters at another rate"
+    assert source._imu.alignment.period_s == 0.02, "the same filters at another rate"
 
 
 @pytest.mark.parametrize("set_by_s", [0.0, -3600.0, -0.05, 0.05, 3600.0])

@@ -354,13 +354,13 @@ def test_where_the_sensors_own_imu_is() -> None:
     assert imu_position("BFT-SENS-ECAT-M8", (0.0, 0.01, 0.0)) == (0.0, 0.01, 0.0)
     source = ImuSource((0.01, 0.02, 0.03), (0.1, 0.2, 0.3))
     assert source.lever_of("BFT-SENS-ECAT-M8") == pytest.approx((-0.09, -0.18, -0.27))
-    before = source.alignment
+    before = source._imu.alignment
     source.configure(InForce(SensorInfo(name="BFT-SENS-ECAT-M8")))
-    assert source.alignment is before, "settings and rate are the same"
+    assert source._imu.alignment is before, "settings and rate are the same"
     for settings, rate_hz in (({"sinc_length": 64}, None), ({"sinc_length": 64}, 800.0)):
         source.configure(InForce(SensorInfo(rate_hz=rate_hz or 0.0, settings=settings)))
-        assert source.alignment is not before
-        before = source.alignment
+        assert source._imu.alignment is not before
+        before = source._imu.alignment
 
 
 def test_why_there_is_no_specific_force() -> None:
