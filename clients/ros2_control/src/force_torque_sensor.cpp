@@ -125,10 +125,9 @@ private:
             log(Level::warning, "the sensor's setting coordinate_system is on: forces are in the frame stored in the sensor");
         if (sensor.inertia_compensation == true)
             log(Level::warning, "the sensor's setting inertia_compensation is on: it subtracts gravity and inertia itself");
-        if (parameters_.payload.mass > 0.0) {
+        if (const auto& known = loop_->bounds(); known && parameters_.payload.mass > 0.0) {
             const bool is_known = parameters_.payload.accelerometer_offset != Vector3{};
-            const Bounds known = loop_->bounds();
-            const auto rest = known.at({0, 0, 9.80665}, {}, {}), turning = known.at({0, 0, 9.80665}, {}, {20, 0, 0});
+            const auto rest = known->at({0, 0, 9.80665}, {}, {}), turning = known->at({0, 0, 9.80665}, {}, {20, 0, 0});
             log(is_known ? Level::info : Level::warning,
                 (is_known ? "the" : "the accelerometer is not identified: use the file of an identification; the") +
                     std::string(" compensated force may be wrong by ") + detail::text(rest[0]) + " N, torque by " + detail::text(rest[1]) +

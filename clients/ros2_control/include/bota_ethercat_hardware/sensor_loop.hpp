@@ -256,6 +256,7 @@ public:
             client_.close();
             return fail(why, objection_);
         }
+        if (tool_) bounds_ = tool_->bounds(parameters_.on_activate_tare);
         sigset_t all, before;
         sigfillset(&all);
         pthread_sigmask(SIG_SETMASK, &all, &before);  // signals are for the threads of the program
@@ -266,10 +267,9 @@ public:
 
     /// The sensor of `open`.
     const SensorInfo& sensor() const { return *sensor_; }
+    /// Of the compensated wrench with the sensor of `open`, if there is a tool.
+    const std::optional<Bounds>& bounds() const { return bounds_; }
     /// s up to which a sample is fresh now: another rate may make it another.
-    /// Of the compensated wrench, if there is a tool and the sensor is known.
-    Bounds bounds() const { return tool_->bounds(parameters_.on_activate_tare); }
-
     double max_age() noexcept { return seconds(latest_.newest().max_age_ns); }
     /// The newest reading, which the next `read` shows, or a newer one.
     const bota_ethercat::Reading& reading() noexcept { return latest_.newest().reading; }
@@ -474,6 +474,7 @@ private:
     std::atomic<bool> stopping_{false}, is_tared_{false};
     Wrench tared_offset_{};  // while `is_tared_`: the receiving thread is to go by it
     Gate gate_;  // the control thread's
+    std::optional<Bounds> bounds_;  // since `open`, for any thread
     std::thread thread_;
 };
 
