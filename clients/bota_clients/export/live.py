@@ -22,6 +22,7 @@ from bota_clients.export.windows import Arrays, Windows, interpolated, read_tool
 from bota_clients.recording.columns import columns
 from bota_clients.recording.order import TimeAxis
 from bota_ethercat.client import Client
+from bota_ethercat.client.session import Item
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.stream.timeline import InForce
@@ -70,16 +71,31 @@ class LiveWindows:
         """
         monotonic = self._client.channel.monotonic_ns
         deadline_ns, windows = monotonic() + round(timeout_s * 1e9), self._windows
-        self._take(0.0)
-        while (instant := self._instant(stamp_ns, monotonic_ns)) > windows.until_ns or not self._clocks.size:
-            if (left_ns := deadline_ns - monotonic()) <= 0:
-                break
-            self._take(left_ns * 1e-9)
+        items = list(self._client.poll_all(0.0))
+        while True:
+            left_ns = deadline_ns - monotonic()
+            if left_ns <= 0 or not self._is_early(items, stamp_ns, monotonic_ns):
+                self._take(items)
+                instant, items = self._instant(stamp_ns, monotonic_ns), []
+                if left_ns <= 0 or (self._clocks.size and instant <= windows.until_ns):
+                    break
+            items += self._client.poll_all(left_ns * 1e-9)
         found = windows.at(np.array([instant]), is_partial=True)
         return {name: array[0] for name, array in found.items()} | {
             "monotonic_ns": np.array(instant - self._shift_ns),
             "is_complete": np.array(0 <= instant <= windows.until_ns),
         }
+
+    def _is_early(self, items: list[Item], stamp_ns: int | None, monotonic_ns: int | None) -> bool:
+        """Whether the newest frame comes before the instant: frames wait, many at once cost what one does."""
+        frames = (each for each in reversed(items) if isinstance(each, DataMessage))
+        newest = next((each for each in frames if each.sensor == self._sensor), None)
+        if newest is None or not self._clocks.size:
+            return False
+        delay_ns = int(self._clocks[1, -1]) - self._windows.until_ns
+        if monotonic_ns is not None:
+            return newest.monotonic_ns - delay_ns < monotonic_ns
+        return stamp_ns is not None and newest.stamp_ns - delay_ns < stamp_ns
 
     def _instant(self, stamp_ns: int | None, monotonic_ns: int | None) -> int:
         """On the axis of the windows; -1 if nothing is known."""
@@ -95,10 +111,9 @@ class LiveWindows:
         nearest = 0 if stamp_ns < stamps[0] else -1
         return int(instants[nearest]) + stamp_ns - int(stamps[nearest])
 
-    def _take(self, timeout_s: float) -> None:
-        """What has arrived, or what arrives next."""
+    def _take(self, items: list[Item]) -> None:
         frames = list[DataMessage]()
-        for item in [*self._client.poll_all(timeout_s), None]:
+        for item in [*items, None]:
             if isinstance(item, DataMessage):
                 if item.sensor == self._sensor:
                     frames.append(item)
