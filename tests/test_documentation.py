@@ -83,7 +83,7 @@ def patterns(source: str) -> set[str]:
     for node in ast.walk(ast.parse(source)):
         match node:
             case ast.JoinedStr(values=values):
-                text = "".join(each.value if isinstance(each, ast.Constant) else "\0" for each in values)
+                text = "".join(str(each.value) if isinstance(each, ast.Constant) else "\0" for each in values)
             case ast.Constant(value=str(text)):
                 pass
             case _:

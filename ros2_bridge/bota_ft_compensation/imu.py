@@ -31,7 +31,7 @@ from bota_ft_compensation.stationary import triple
 
 # Of a check of gravity: looks, s apart on average, and at most; rad/s, and m/s² of deviation, that are rest;
 # m/s² that is wrong.
-_LOOKS, _APART_S, _MOST_S, _RESTING, _STEADY, _WRONG = 100, 0.01, 0.1, 0.1, 0.3, 2.0
+_LOOKS, _APART_S, _MOST_S, _RESTING, _STEADY, _WRONG = 50, 0.02, 0.2, 0.1, 0.3, 2.0
 _UNEVEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
 _READ: Final = (ACCELERATION, ANGULAR_RATE)
 IMU_IS_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
@@ -132,7 +132,7 @@ class GravityCheck:
     def __init__(self) -> None:
         self.problem = ""  # what is wrong and what to do, a clause
         self.due_s = -math.inf  # of the next look
-        self._rows, self._last_s = list[tuple[float, ...]](), -math.inf
+        self._rows, self._last_s = list[tuple[Sample, Vector3]](), -math.inf
 
     def look(self, sample: Sample, felt: Vector3 | None, time_s: float, *, by_imu: bool) -> None:
         """At the first sample from `due_s` on, and the specific force that the source gave for it, m/s²."""
@@ -140,15 +140,18 @@ class GravityCheck:
         if not 0.0 < passed_s <= _MOST_S:
             rows.clear()
         self.due_s = time_s + _APART_S * (0.5 + len(rows) * _UNEVEN % 1.0)
-        if felt is None or not any(sample.acceleration) or judge(sample, _READ)[1]:
+        if felt is None:
             rows.clear()
             return
-        rows.append((*sample.acceleration, *sample.angular_rate, *felt))
+        rows.append((sample, felt))
         if len(rows) == _LOOKS:
-            self._judge(np.array(rows), by_imu=by_imu)
+            if not any(judge(each, _READ)[1] or not any(each.acceleration) for each, _ in rows):
+                self._judge(
+                    np.array([(*each.acceleration, *each.angular_rate, *at) for each, at in rows]), by_imu
+                )
             rows.clear()
 
-    def _judge(self, rows: Array, *, by_imu: bool) -> None:
+    def _judge(self, rows: Array, by_imu: bool) -> None:
         read, rate, felt = np.split(rows.mean(axis=0), 3)
         size = math.hypot(*read)
         # Of nothing at rest is it so small: then the rate's unit is as wrong.

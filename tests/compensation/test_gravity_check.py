@@ -49,8 +49,8 @@ def looked(motion: Motion, seconds: float, *, by_imu: bool = False, rate_hz: flo
     ("read", "felt", "by_imu", "told"),
     [
         (
-            (0.0, 0.0, 1.0),
-            (0.0, 0.0, 1.0),
+            (0.0, 0.0, 1.04),
+            (0.0, 0.0, 1.04),
             True,
             "reads 1 m/s² at rest, where gravity is 9.81: check imu_raw",
         ),
@@ -68,7 +68,7 @@ def test_what_is_wrong_at_rest_is_said_within_seconds(
     read: Vector3, felt: Vector3, by_imu: bool, told: str, rate_hz: float
 ) -> None:
     """Also by a gyroscope whose rest reads 1.7, as its 1.7 °/s taken for rad/s do."""
-    rate = (1.7, 0.0, 0.0) if read[2] == 1.0 else (0.03, 0.0, 0.0)
+    rate = (1.7, 0.0, 0.0) if read[2] == 1.04 else (0.03, 0.0, 0.0)
     found = looked(still(read, felt, rate), 2.2, by_imu=by_imu, rate_hz=rate_hz)
     assert len(found) == bool(told)
     assert re.search(told, "".join(found))

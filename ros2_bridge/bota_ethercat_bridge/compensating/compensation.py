@@ -101,7 +101,8 @@ class Compensation:
         self.published = self.withheld = 0
         self.why_withheld = ""
         self.decode = decoder(parameters).sample
-        self.gravity, self.sample = GravityCheck(), None
+        self.gravity = GravityCheck()
+        self.sample: Sample | None = None
         self.time_s = self.stamp_s = 0.0
         self.configure(parameters)
 
