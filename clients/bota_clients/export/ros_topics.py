@@ -101,7 +101,7 @@ class _Sender:
     """Writes one topic."""
 
     def __init__(self, writer: Writer, topic: Topic) -> None:
-        definition = _STORE.generate_msgdef(topic.kind)[0]
+        definition = _STORE.generate_msgdef(topic.kind, ros_version=2)[0]
         schema = writer.register_schema(topic.kind, "ros2msg", definition.encode())
         self._writer, self._topic, self._sequence = writer, topic, 0
         self._channel = writer.register_channel(f"/{topic.name}", "cdr", schema)
