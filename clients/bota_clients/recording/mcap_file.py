@@ -5,6 +5,7 @@ before the first frame (25 times the time to open), takes a truncated record for
 whatever a zstd frame claims to hold.
 
 - Opening reads record headers, and only those chunks that introduce a channel or have no message index.
+- Messages outside of chunks, as other programs write them, are taken for chunks without compression.
 - An incomplete record at the end of a file without a footer is ignored, and `cut_off` says so.
 - Everything else that is malformed raises RecordingError with its position.
 - Every length is checked against a limit before anything is allocated for it. Every CRC is verified.
@@ -40,6 +41,7 @@ MAX_CHUNK: Final = 64 * 1024 * 1024
 MAX_CHUNKS: Final = 2_000_000  # ten days at two a second
 MAX_METADATA: Final = 1024 * 1024  # bytes
 MAX_CHANNELS: Final = 4096
+_BARE: Final = 1024 * 1024  # bytes of messages outside of chunks that are taken for one
 
 _RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -48,7 +50,7 @@ _SHORT: Final = 256  # bytes: longer ones than a frame
 _INDEX: Final = struct.Struct("<HI")  # channel, bytes that follow: 16 for each message
 # With the trailing magic: the last bytes of a complete file.
 _FOOTER_SIZE: Final = struct.calcsize("<BQQQI8s")
-_UNREADABLE: Final = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
+_UNREADABLE: Final = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError, RuntimeError)
 
 Rows = npt.NDArray[np.uint8]  # (n, bytes of each)
 RECORD_HEAD: Final = _RECORD.size
@@ -64,6 +66,7 @@ class _ChunkRecord(NamedTuple):
     offset: int
     length: int
     counts: Counter[int]
+    is_bare: bool = False  # records outside of chunks
 
 
 def _alike(data: memoryview, position: int, stride: int) -> int:
@@ -138,22 +141,10 @@ class McapFile:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def messages(self, channels: Collection[int]) -> Iterator[tuple[int, int, memoryview]]:
-        """Channel, log time (ns) and body of the messages of these channels in file order.
-
-        RecordingError at the first corrupt chunk.
-        """
-        wanted = frozenset(channels)
-        for rows in self.rows(wanted):
-            for row in rows:
-                found = message_in(row)
-                if found[0] in wanted:
-                    yield found
-
     def rows(self, channels: Collection[int]) -> Iterator[Rows]:
         """The records of messages, with their heads, in file order, of chunks that have these channels.
 
-        Shorter ones are padded with zeros. RecordingError as `messages`.
+        Shorter ones are padded with zeros. RecordingError at the first corrupt chunk.
         """
         with progress(self.path.name, len(self._chunks)) as reach:
             for number, chunk in enumerate(self._chunks):
@@ -216,9 +207,7 @@ class McapFile:
             record = self._parse(Metadata, self._read_at(body, length), body)
             self.notes[record.name] = record.metadata
         elif opcode == Opcode.CHUNK:
-            if len(self._chunks) >= MAX_CHUNKS:
-                raise self._damaged(body, f"it has more than {MAX_CHUNKS} chunks")
-            self._chunks.append(_ChunkRecord(body, length, Counter()))
+            self._add(_ChunkRecord(body, length, Counter()))
         elif opcode == Opcode.MESSAGE_INDEX:
             head = self._read_at(body, min(length, _INDEX.size))
             channel, size = _INDEX.unpack(head) if len(head) == _INDEX.size else (0, -1)
@@ -226,7 +215,17 @@ class McapFile:
                 raise self._damaged(body, "a message index is malformed or belongs to no chunk")
             self._chunks[-1].counts[channel] = size // 16
         elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
-            raise RecordingError(f"{self.path} has messages outside of chunks: it is no recording")
+            begin, size = body - _RECORD.size, _RECORD.size + length
+            last = self._chunks[-1] if self._chunks else None
+            if last and last.is_bare and last.offset + last.length == begin and last.length + size <= _BARE:
+                self._chunks[-1] = last._replace(length=last.length + size)
+            else:
+                self._add(_ChunkRecord(begin, size, Counter(), is_bare=True))
+
+    def _add(self, chunk: _ChunkRecord) -> None:
+        if len(self._chunks) >= MAX_CHUNKS:
+            raise self._damaged(chunk.offset, f"it has more than {MAX_CHUNKS} chunks")
+        self._chunks.append(chunk)
 
     def _index_chunk(self, chunk: _ChunkRecord) -> None:
         """Take the channels that a chunk introduces, and count its messages."""
@@ -271,18 +270,24 @@ class McapFile:
     def _unpack(self, chunk: _ChunkRecord) -> memoryview:
         """The decompressed records of a chunk."""
         self._bound(chunk.offset, chunk.length, MAX_CHUNK)
+        if chunk.is_bare:
+            return memoryview(self._read_at(chunk.offset, chunk.length))
         found = self._parse(Chunk, self._read_at(chunk.offset, chunk.length), chunk.offset)
         size = found.uncompressed_size
         self._bound(chunk.offset, size, MAX_CHUNK)
-        if found.compression not in ("", "zstd"):
-            how = printable(found.compression, 16)
-            raise RecordingError(
-                f"{self.path} is compressed with {how}, which is not read: write it again with zstd, or none"
-            )
+        data = found.data
         try:
-            if found.compression and zstandard.frame_content_size(found.data) not in (-1, size):
-                raise ValueError("its sizes differ")
-            data = self._zstd.decompress(found.data, size) if found.compression else found.data
+            if found.compression == "zstd":
+                if zstandard.frame_content_size(data) not in (-1, size):
+                    raise ValueError("its sizes differ")
+                data = self._zstd.decompress(data, size)
+            elif found.compression == "lz4":
+                from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415 - mcap needs it, and few files
+
+                data = LZ4FrameDecompressor().decompress(data, size + 1)
+            elif found.compression:
+                how = f"compressed with {printable(found.compression, 16)}, which is not read"
+                raise RecordingError(f"{self.path} is {how}: write it again with zstd, or none")
             if found.uncompressed_crc not in (0, zlib.crc32(data)):
                 raise ValueError("its checksum differs")
             if len(data) != size:
