@@ -13,6 +13,7 @@ to the sensor's own offset marks the same samples if the server says so beforeha
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from typing import Final
 
@@ -56,6 +57,7 @@ class LiveWindows:
         self._windows = Windows(length, tool=read_tool(tool) if tool else None, imu_units=imu_units)
         self._axis, self._keep_ns, self._shift_ns = TimeAxis(), round(keep_s * 1e9), 0
         self._in_force: InForce | None = None
+        self._never = threading.Event()
         self._clocks = np.zeros((2, 0), np.int64)  # of the samples that are kept: both stamps
 
     def at(
@@ -69,33 +71,40 @@ class LiveWindows:
         Call it at least every second, so that no samples pile up. RecordingError if the sampling rate is
         unknown.
         """
-        monotonic = self._client.channel.monotonic_ns
-        deadline_ns, windows = monotonic() + round(timeout_s * 1e9), self._windows
-        items = list(self._client.poll_all(0.0))
+        channel, windows, items = self._client.channel, self._windows, list(self._client.poll_all(0.0))
+        deadline_ns = channel.monotonic_ns() + round(timeout_s * 1e9)
         while True:
-            left_ns = deadline_ns - monotonic()
-            if left_ns <= 0 or not self._is_early(items, stamp_ns, monotonic_ns):
+            left_ns, early_ns = (
+                deadline_ns - channel.monotonic_ns(),
+                self._early_ns(items, stamp_ns, monotonic_ns),
+            )
+            if left_ns <= 0 or early_ns <= 0:
                 self._take(items)
                 instant, items = self._instant(stamp_ns, monotonic_ns), []
                 if left_ns <= 0 or (self._clocks.size and instant <= windows.until_ns):
                     break
-            items += self._client.poll_all(left_ns * 1e-9)
+            else:
+                channel.wait(self._never, min(early_ns, left_ns) * 1e-9)
+            items += self._client.poll_all(max(left_ns - early_ns, 0) * 1e-9)
         found = windows.at(np.array([instant]), is_partial=True)
         return {name: array[0] for name, array in found.items()} | {
             "monotonic_ns": np.array(instant - self._shift_ns),
             "is_complete": np.array(0 <= instant <= windows.until_ns),
         }
 
-    def _is_early(self, items: list[Item], stamp_ns: int | None, monotonic_ns: int | None) -> bool:
-        """Whether the newest frame comes before the instant: frames wait, many at once cost what one does."""
+    def _early_ns(self, items: list[Item], stamp_ns: int | None, monotonic_ns: int | None) -> int:
+        """How long before the instant the newest of these frames was measured; 0: it was not.
+
+        Frames wait for each other, as many at once cost what one does.
+        """
         frames = (each for each in reversed(items) if isinstance(each, DataMessage))
         newest = next((each for each in frames if each.sensor == self._sensor), None)
         if newest is None or not self._clocks.size:
-            return False
+            return 0
         delay_ns = int(self._clocks[1, -1]) - self._windows.until_ns
         if monotonic_ns is not None:
-            return newest.monotonic_ns - delay_ns < monotonic_ns
-        return stamp_ns is not None and newest.stamp_ns - delay_ns < stamp_ns
+            return monotonic_ns + delay_ns - newest.monotonic_ns
+        return 0 if stamp_ns is None else stamp_ns + delay_ns - newest.stamp_ns
 
     def _instant(self, stamp_ns: int | None, monotonic_ns: int | None) -> int:
         """On the axis of the windows; -1 if nothing is known."""
