@@ -74,18 +74,16 @@ class LiveWindows:
         channel, windows, items = self._client.channel, self._windows, list(self._client.poll_all(0.0))
         deadline_ns = channel.monotonic_ns() + round(timeout_s * 1e9)
         while True:
-            left_ns, early_ns = (
-                deadline_ns - channel.monotonic_ns(),
-                self._early_ns(items, stamp_ns, monotonic_ns),
-            )
+            left_ns = deadline_ns - channel.monotonic_ns()
+            early_ns = min(max(self._early_ns(items, stamp_ns, monotonic_ns), 0), left_ns)
             if left_ns <= 0 or early_ns <= 0:
                 self._take(items)
                 instant, items = self._instant(stamp_ns, monotonic_ns), []
                 if left_ns <= 0 or (self._clocks.size and instant <= windows.until_ns):
                     break
             else:
-                channel.wait(self._never, min(early_ns, left_ns) * 1e-9)
-            items += self._client.poll_all(max(left_ns - early_ns, 0) * 1e-9)
+                channel.wait(self._never, early_ns * 1e-9)
+            items += self._client.poll_all((left_ns - early_ns) * 1e-9)
         found = windows.at(np.array([instant]), is_partial=True)
         return {name: array[0] for name, array in found.items()} | {
             "monotonic_ns": np.array(instant - self._shift_ns),
