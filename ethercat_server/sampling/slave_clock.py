@@ -251,7 +251,7 @@ class EventTimes:
 
         To be asked for each new sample while they are trusted. `variance` is that of `expected_ns`.
         """
-        trust, late = self.trust, 0.0
+        trust = self.trust
         if self.instant_ns:
             late = (self.instant_ns - expected_ns) / period_ns
             off_ns = abs(late - round(late) if late > -0.5 else late) * period_ns

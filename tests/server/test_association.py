@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,7 +22,6 @@ from ethercat_server.sampling.phase import SensorPhase
 from ethercat_server.sampling.round_trip import RoundTrip
 from ethercat_server.sampling.sample_clock import SampleClock
 from ethercat_server.sampling.schedule import Schedule, best_margin_ns
-from ethercat_server.sampling.slave_clock import LocalClock
 from ethercat_server.sampling.trust import TRANSITIONS, Evidence, Trust, TrustState
 
 PERIOD_NS, LEAST_NS = 1_000_000, 50_000
@@ -268,54 +266,6 @@ def test_how_late_it_is_read_depends_on_what_an_early_poll_costs(
     cost: float, deviation: float, margin: float
 ) -> None:
     assert best_margin_ns(cost, deviation) == pytest.approx(margin, abs=1e-3)
-
-
-def local_clock(exchanges: int = 300) -> tuple[LocalClock, Callable[..., None]]:
-    """One that goes like this computer's; and an exchange in which it was off by so much."""
-    bus, now_ns = RoundTrip(), 10**9
-    bus.learn_shortest(0, 100_000)
-    clock = LocalClock(bus)
-
-    def exchange(off_ns: int = 0, took_ns: int = 100_000) -> None:
-        nonlocal now_ns
-        now_ns += 10**6
-        clock.local, clock.back_ns = now_ns + 50_000 + off_ns, now_ns + took_ns
-        clock.learn(now_ns, now_ns + took_ns, 1)
-
-    for number in range(exchanges):
-        assert clock.is_known is (number >= 4 + 8 + 12 + 16 + 20 + 24 + 28 + 5 * 32)
-        exchange()
-    return clock, exchange
-
-
-@pytest.mark.parametrize(
-    ("off_us", "moved_us"),
-    [(0, 0), (-49, 0), (49, 0), (-55, 5), (55, -5), (-99, 49), (99, -49), (-101, 0), (101, 0)],
-)
-def test_a_local_time_is_within_the_exchange_that_read_it(off_us: int, moved_us: int) -> None:
-    """What is less beyond than half of an exchange moves all instants; what is more has jumped."""
-    clock, exchange = local_clock()
-    exchange(off_us * 1000, 100_000)
-    assert clock.moved_ns == pytest.approx(moved_us * 1000, abs=1)
-    assert clock.phase.phase_ns == pytest.approx(clock.local_at + clock.moved_ns, abs=1)
-
-
-def test_a_local_clock_that_jumped_is_known_anew_by_the_third_block() -> None:
-    clock, exchange = local_clock(304)
-    for number in range(3 * 32):
-        assert (clock.restarts, clock.is_known) == (0, True), number
-        exchange(10**8)
-    assert (clock.restarts, clock.is_known, clock.excess_ns) == (1, False, 0.0)
-
-
-def test_an_exchange_is_short_by_the_best_of_its_block() -> None:
-    clock, exchange = local_clock()
-    assert clock.short_ns == 100_000
-    for _ in range(64):
-        exchange(20_000, 140_000)
-    assert clock.short_ns == 140_000
-    assert 0 < clock.excess_ns < 20_000
-    assert clock.doubt_ns == pytest.approx(5 * math.sqrt(clock.phase.variance))
 
 
 def schedule(usual_us: float = 100, variance: float = 0.0) -> Schedule:

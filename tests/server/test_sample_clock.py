@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from ethercat_server.sampling.phase import SensorPhase
 from ethercat_server.sampling.trust import Trust, TrustState
 from tests.clock_simulation import SECOND, Card, ClockSimulation, Controller, Machine, Outcome, Sensor
 from tests.simulation import more_if_long
@@ -133,18 +132,6 @@ def test_a_clock_that_restarts_is_found_again(rate_hz: float, card: Card, bound:
         for sample in shown.samples[bound:]:
             assert sample.locked
             assert abs(sample.error_ns) < 100e3
-
-
-def test_after_four_contradictions_in_a_row_the_phase_is_unknown() -> None:
-    """Not before: a stall is no restart."""
-    phase, deviations = SensorPhase(1e6), []
-    phase.begin(0.0, 1e3)
-    for _ in range(4):
-        phase.learn_instant(phase.phase_ns + 3e5, 1e6)
-        deviations.append(math.sqrt(phase.variance) / phase.period_ns)
-        phase.advance(1)
-    assert max(deviations[:3]) < 0.01
-    assert deviations[3] > 0.25
 
 
 def draw(seed: int, stolen: float) -> tuple[Sensor, Card, Machine]:
@@ -339,12 +326,6 @@ def test_no_lie_costs_a_sample_on_a_slow_card(late_ns: float, since_s: float) ->
         assert outcome.exchanges < 1.05
 
 
-def test_event_times_stay_trusted_that_differ_from_polls_by_a_part_of_a_long_round_trip() -> None:
-    card = Card(2.2e6, spread=0, jitter_ns=5e4)
-    simulation = run(Controller(late_ns=-200e3), Sensor(800.0, ppm=150.0), card, seconds=5.0)
-    assert state(simulation) is TrustState.TRUSTED
-
-
 @pytest.mark.parametrize(
     "controller",
     [
@@ -361,93 +342,6 @@ def test_event_times_that_are_worse_than_polling_are_not_used(controller: Contro
     assert percentile(outcome.errors_ns, 99) < 12e3
     by_polling = run(None, seconds=12.0).outcome(4.0)
     assert percentile(outcome.errors_ns, 99) < percentile(by_polling.errors_ns, 99) + 3e3
-
-
-def test_pauses_between_trials_double_until_event_times_have_proved_right_for_long() -> None:
-    """So those that are hardly right do not switch stamps on and off."""
-    simulation, lying = run(HONEST, Sensor(150.0), seconds=3.0), Controller(jitter_ns=50e3)
-
-    def run_until(wanted: TrustState) -> float:
-        since_s = simulation.now_ns / 1e9
-        while state(simulation) is not wanted:
-            simulation.run(simulation.now_ns / 1e9 + 0.1)
-        return simulation.now_ns / 1e9 - since_s
-
-    def pause_s() -> float:
-        run_until(TrustState.REFUSED)
-        return run_until(TrustState.TRIAL)
-
-    simulation.controller = lying
-    assert [pause_s() for _ in range(3)] == pytest.approx([10, 20, 40], abs=0.5)
-    simulation.controller = HONEST
-    run_until(TrustState.TRUSTED)
-    simulation.run(simulation.now_ns / 1e9 + 61.0)
-    simulation.controller = lying
-    assert pause_s() == pytest.approx(10, abs=0.5)
-
-
-def show(
-    simulation: ClockSimulation, took_ns: float, ago_ns: float, off_ns: float, count: int,
-    every_ns: float = 30e6,
-) -> list[float | None]:  # fmt: skip
-    """Exchanges that took so long, each with a sample of `ago_ns` before that is `off_ns` from the expected.
-
-    What `date` makes of them while event times are trusted. The local clock learns nothing meanwhile: after
-    seconds it is where its rate takes it.
-    """
-    events, period_ns, dated = simulation.clock.events, simulation.clock.period_ns, []
-    assert events is not None
-    for _ in range(count):
-        simulation.now_ns += every_ns
-        sent = int(simulation.now_ns)
-        back = sent + int(took_ns)
-        latched = HONEST.local(sent), 1, HONEST.local(sent - ago_ns), 1
-        events.observe(latched, sent, back, True, period_ns)
-        if events.are_trusted:
-            dated.append(events.date(sent - ago_ns - off_ns, period_ns, 1e6, sent, back))
-        else:
-            events.compare(0.0, 1e6, back)
-    return dated
-
-
-@pytest.mark.parametrize(("took_ns", "counts"), [(20e6, False), (100e3, True)])
-def test_exchanges_of_a_busy_machine_are_not_held_against_event_times_on_trial(
-    took_ns: float, counts: bool
-) -> None:
-    """An exchange was away for long then: who knows what has held up what."""
-    simulation = run(HONEST, seconds=0.8)
-    show(simulation, took_ns, ago_ns=1e9, off_ns=0, count=300)
-    assert bool(trust(simulation).why) is counts
-
-
-@pytest.mark.parametrize(
-    ("took_ns", "ago_ns", "off_ns", "dates", "counts"),
-    [
-        pytest.param(100e3, 1e6, 0, True, False, id="right"),
-        pytest.param(100e3, 1e6, 40e3, False, True, id="not as expected"),
-        pytest.param(20e6, 1e6, 40e3, False, False, id="not as expected, but the machine is busy"),
-        pytest.param(100e3, 1e6, 300e3, True, False, id="the sensor's own clock is another"),
-        pytest.param(100e3, 5e6, 0, False, False, id="older than the newest sample can be"),
-        pytest.param(100e3, 1e9, 0, False, True, id="not between the frames"),
-        pytest.param(20e6, 1e9, 0, False, False, id="not between the frames, but the machine is busy"),
-    ],
-)
-def test_which_samples_trusted_event_times_date_and_which_count_against_them(
-    took_ns: float, ago_ns: float, off_ns: float, dates: bool, counts: bool
-) -> None:
-    simulation = run(HONEST, seconds=3.0)
-    dated = show(simulation, took_ns, ago_ns, off_ns, count=6)
-    assert [late is not None for late in dated] == [dates] * (5 if counts else 6), "the fifth is too much"
-    assert bool(trust(simulation).why) is counts
-
-
-@pytest.mark.parametrize("seed", more_if_long([1, 2], range(1, 25)))
-def test_samples_that_fit_make_up_for_those_that_do_not(seed: int) -> None:
-    simulation = run(HONEST, seconds=3.0, seed=seed)
-    for _ in range(6):
-        show(simulation, 100e3, 1e6, 40e3, count=1, every_ns=3e6)
-        show(simulation, 100e3, 1e6, 0, count=100, every_ns=3e6)
-    assert not trust(simulation).why
 
 
 @pytest.mark.parametrize(
