@@ -105,7 +105,7 @@ def find_losses(number: int, decisions: Sequence[Decision]) -> Iterator[Loss]:
     gaps = sorted(after - before for before, after in pairwise(fresh_ns))
     period_ns = gaps[len(gaps) // 2] if gaps else 0
     took = sorted(decision.record.duration_ns for decision in decisions)
-    long_ns = took[len(took) // 2] + period_ns / 2 if took else 0
+    long_ns = took[len(took) // 2] + period_ns / 2
     before_ns, invalid = 0, 0
     # Why the count at the sample before was uncertain; that of the first is, with nothing before it.
     doubt: tuple[str, str] | None = ("uncertain", "what came before is not in the trace")
@@ -119,7 +119,6 @@ def find_losses(number: int, decisions: Sequence[Decision]) -> Iterator[Loss]:
             if invalid == 1:
                 text = f"it took no part in an exchange (working counter {record.wkc})"
                 yield Loss(sent_ns, number, "not in the exchange", text)
-            continue
         if record.kind is not RecordKind.FRESH:
             continue
         lost = decision.steps - 1
@@ -176,8 +175,8 @@ def _picture(decisions: Sequence[Decision], losses: Sequence[Loss]) -> Iterator[
     cells = {int((each.record.sent_ns - begin_ns) * 1e-9 / _CELL_S): 0 for each in decisions}
     most = max(cells)
     for loss in losses:
-        at = min(most, max(0, int((loss.at_ns - begin_ns) * 1e-9 / _CELL_S)))
-        cells[at] = max(cells.get(at, 0), order.index(loss.cause))
+        at = int((loss.at_ns - begin_ns) * 1e-9 / _CELL_S)
+        cells[at] = max(cells[at], order.index(loss.cause))
     for begin in sorted({at // _CELLS * _CELLS for at in cells}):  # none for a pause
         marks = (_MARKS[order[cells.get(at, 0)]] for at in range(begin, min(begin + _CELLS, most + 1)))
         yield f"  {begin * _CELL_S:5.0f} s {''.join(marks)}"

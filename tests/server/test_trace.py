@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import itertools
 import json
 import random
+import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import pytest
 
 from ethercat_server.daemon.loss_traces import LossTraces
 from ethercat_server.doctor.cli import main as doctor
-from ethercat_server.doctor.trace import find_losses, show
+from ethercat_server.doctor.trace import find_losses, save, show
+from ethercat_server.errors import ServerError
 from ethercat_server.sampling.replay import Decision, Record, Trace, TraceError
 from ethercat_server.sampling.trace import RECORD, Clocks, RecordKind, Ring, learn_note
 from ethercat_server.simulation.machine import Machine
@@ -365,6 +368,47 @@ def test_sensors_are_shown_one_by_one_and_their_losses_in_order(
         "   0.2000 s  sensor 2: 1 lost: it was polled and gave none",
         "   0.3000 s  sensor 0: 1 lost: it was polled and gave none",
     ]  # fmt: skip
+
+
+def given(*parts: bytes, said: int = 0, **more: object) -> Callable[..., Any]:
+    """A client of a server that answers each request with the next of these parts of its trace."""
+    answers, whole = iter(parts), b"".join(parts)
+
+    def ask(action: str, offset: int) -> dict[str, Any]:
+        part = next(answers)
+        assert (action, whole[offset:].startswith(part)) == ("trace", True)
+        return {"data": base64.b64encode(part).decode(), "size": said or len(whole), **more}
+
+    def client(*where: object, **how: bool) -> Any:
+        assert (where, how) == ((12001, "localhost"), {"stream": False, "reconnect": False})
+        return SimpleNamespace(connect=lambda: contextlib.nullcontext(SimpleNamespace(ask=ask)))
+
+    return client
+
+
+def test_a_trace_comes_in_parts_and_is_whole_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation, path, server = Simulation(), tmp_path / "a.trace", "server at localhost:12001"
+    simulation.run(0.2)
+    data, foreign = trace_of(simulation), "the program at localhost:12001 is not a compatible ethercat-server"
+    for client, to, why in (
+        (given(data[:1000], data[1000:-1], data[-1:]), path, ""),
+        (given(data[:9], b"", said=len(data)), path, f"the {server} ended its trace early: ask again"),
+        (given(b"{}\n"), path, f"no trace of the {server}: it is no trace of"),
+        (given(data, data="?"), path, foreign),
+        (given(data, size=None), path, foreign),
+        (given(data), tmp_path, f"{tmp_path} cannot be written: Is a directory"),
+    ):
+        monkeypatch.setattr("ethercat_server.doctor.trace.Client", client)
+        if why:
+            with pytest.raises(ServerError, match=f"^{re.escape(why)}"):
+                save(to)
+        else:
+            assert save(to) == f"{path}: {len(data) // 1024} KiB; 'ethercat-doctor {path}' shows it"
+        assert path.read_bytes() == data
+    head, rest = data.split(b"\n", 1)
+    for sensors, model in (("M8", "None"), (["M8"], "None"), ([{"model": "M" * 41}], "M" * 37 + "...")):
+        path.write_bytes(json.dumps({**json.loads(head), "sensors": sensors}).encode() + b"\n" + rest)
+        assert [*show(path)][1] == f"\nsensor 0 ({model})"
 
 
 def test_who_may_not_control_the_server_gets_no_trace() -> None:
