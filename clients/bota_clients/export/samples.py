@@ -34,20 +34,18 @@ def samples_of(
     On `axis`, by default a new one. RecordingError.
     """
     batches = (axis or TimeAxis()).batches(recording.batches(sensor, windows.imu_units, is_whole=True))
-    held, first_ns, new = list[Columns](), 0, NewSamples()
+    held, new = list[Columns](), NewSamples()
     begin, taken = 0, 0  # samples: number of the first that is held, and how many were taken
     for in_force, batch in itertools.chain(batches, [(None, None)]):
         if in_force is not None and batch is not None:
             windows.configure(in_force)
-            is_new, flags = new.among(batch.flags, sensor)
-            marked = replace(batch, flags=flags)
-            samples = windows.add(marked if is_new.all() else marked.where(is_new))
-            held = [joined([*held, samples])]
+            _, flags = new.among(batch.flags, sensor)
+            held = [joined([*held, windows.add(replace(batch, flags=flags))])]
         slots = windows.take(rest=in_force is None)
         if not len(slots):
             continue
-        first_ns = first_ns if taken else windows.begin_ns
-        yield _rows(slots, held[0], slots["number"] - begin, first_ns, tool=windows.stream is not None)
+        is_with_tool = windows.stream is not None
+        yield _rows(slots, held[0], slots["number"] - begin, windows.begin_ns, tool=is_with_tool)
         taken = int(slots["number"].max(initial=taken - 1)) + 1
         keep = max(taken - 1, 0)  # lost samples that follow are between this one and the next
         held, begin = [held[0].where(slice(keep - begin, None))], keep
