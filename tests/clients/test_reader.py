@@ -7,6 +7,7 @@ import random
 import re
 import struct
 import zlib
+from collections import OrderedDict, defaultdict
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,10 +23,12 @@ from bota_clients.recording import file_format
 from bota_clients.recording.columns import RECORD, columns, joined, table_of
 from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
 from bota_clients.recording.mcap_file import MAX_CHUNK, McapFile
-from bota_clients.recording.reader import open_recording
+from bota_clients.recording.reader import REWRITTEN, open_recording
 from bota_clients.report.series import of_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import ImuUnits, SampleDecoder
+from bota_ethercat.replies import SensorInfo
+from bota_ethercat.stream.timeline import InForce, Timeline
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, write
 from tests.clients.test_export_windows import tared
 
@@ -70,17 +73,6 @@ def test_frames_come_back_byte_for_byte(path: Path) -> None:
     assert (found.flags.tolist(), found.wkc.tolist()) == ([255], [65535])
 
 
-def test_sensors_are_told_apart(path: Path) -> None:
-    record(path, (frame(n, sensor=n % 2) for n in range(100)), sensors=(0, 1))
-    with open_recording(path) as recording:
-        assert [f.sequence for f in recording.frames(1)] == list(range(1, 100, 2))
-        assert [(s.sensor, s.info.serial, s.frames) for s in recording.sensors] == [
-            (0, 100, 50),
-            (1, 101, 50),
-        ]
-        assert list(recording.frames(7)) == []
-
-
 def test_settings_are_known_over_time(path: Path) -> None:
     first, then = describe(0, chop=False), describe(0)
     first["sensors"][0]["serial"] = 2**32 - 1
@@ -101,14 +93,6 @@ def test_settings_are_known_over_time(path: Path) -> None:
         assert recording.events[0].name == "reconfigured"
         assert not recording.events[0].by_recorder
         assert recording.end == {"reason": "asked to"}
-
-
-def test_before_it_was_told_what_is_in_force_is_what_was_told_first(path: Path) -> None:
-    told = [describe(0) | {"sensors": [describe(0)["sensors"][0] | {"rate_hz": hz}]} for hz in (800, 1600)]
-    write(path, [frame(0), frame(1), told[0], frame(2), told[1], frame(3)])
-    with open_recording(path) as recording:
-        found = [(in_force.info.rate_hz, batch.sequence.tolist()) for in_force, batch in recording.batches(0)]
-    assert found == [(800, [0, 1]), (800, [2]), (1600, [3])]
 
 
 def test_columns_are_what_the_decoder_gives(path: Path) -> None:
@@ -145,9 +129,11 @@ def test_columns_are_what_the_decoder_gives(path: Path) -> None:
     assert (len(table), table.force.shape, table.orientation.shape) == (0, (0, 3), (0, 4))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(12))
 def test_any_valid_file_is_read_as_the_mcap_library_reads_it(tmp_path: Path, seed: int) -> None:
-    """Chunks of all sizes, two sensors of different process data, other messages between, other writers."""
+    """Chunks of all sizes, two sensors of different process data on any channels, notes and other messages
+    between, other writers; and an index that counts too few messages.
+    """
     draw, path = random.Random(seed), tmp_path / "any.mcap"
     with path.open("wb") as file:
         kind = draw.choice((CompressionType.ZSTD, CompressionType.NONE))
@@ -155,41 +141,106 @@ def test_any_valid_file_is_read_as_the_mcap_library_reads_it(tmp_path: Path, see
         index = IndexType.ALL if has_index else IndexType.NONE
         made = Writer(file, size, kind, index_types=index, enable_data_crcs=has_crc)
         made.start("ros2", "any")
-        made.add_metadata(file_format.METADATA, {"format": "1"})
+        if seed % 4:
+            made.add_metadata(file_format.METADATA, {"format": "1", "sensors": "0 ² x " * 170 + "7 1234"})
         schemas = {
             name: made.register_schema(name, "ros2msg", text.encode())
             for name, text in file_format.DEFINITIONS.items()
         }
-        topics = [file_format.frame_topic(sensor) for sensor in (0, 1)] + [file_format.EVENTS_TOPIC, "/other"]
+        first, second = (file_format.frame_topic(sensor) for sensor in (0, 1))
+        notes = file_format.EVENTS_TOPIC, file_format.DESCRIPTION_TOPIC
+        topics = [first, second, *notes, "/other", first, second]
+        from_ = draw.choice((0, 32_765, 65_528))
+        numbered = type("Numbered", (OrderedDict,), {"__len__": lambda it: from_ + OrderedDict.__len__(it)})
+        made._Writer__channels = numbered()  # type: ignore[attr-defined]
         channels = [
             made.register_channel(topic, "cdr", schemas[list(schemas)[topic.startswith("/ethercat/sensor")]])
             for topic in topics
         ]
+        epochs = itertools.count()
         for number in range(draw.choice((40, 900))):
             sensor = draw.choice((0, 1)) if seed % 2 else number // 50 % 2
             item = frame(number, sensor, draw.choice((0, 0, 0, 1, 2, 4)), draw.choice((61, 61, 77)))
-            made.add_message(channels[sensor], item.stamp_ns, file_format.pack_frame(item), item.stamp_ns)
-            if draw.random() < 0.05:
-                event = file_format.pack_json({"event": "x" * draw.randrange(90), "number": number})
-                made.add_message(channels[2], item.stamp_ns, event, item.stamp_ns)
+            channel = channels[sensor + draw.choice((0, 0, 0, 5))]
+            made.add_message(channel, item.stamp_ns, file_format.pack_frame(item), item.stamp_ns)
+            for of, body in (
+                (0, {"event": "x" * draw.randrange(90), "number": number}),
+                (0, {"event": "offset_changed", "sensor": draw.randrange(2), "offset": [float(number)] * 6}),
+                (0, {"event": draw.choice(("connected", "lost")), "source": "recorder"}),
+                (1, describe(*draw.choice(((0,), (1, 0))), sinc_length=32 + next(epochs))),
+            ):
+                if draw.random() < 0.02:
+                    made.add_message(
+                        channels[2 + of], item.stamp_ns, file_format.pack_json(body), item.stamp_ns
+                    )
             if draw.random() < 0.1:
-                made.add_message(channels[3], item.stamp_ns, bytes(draw.randrange(200)), item.stamp_ns)
+                made.add_message(channels[4], item.stamp_ns, bytes(draw.randrange(200)), item.stamp_ns)
         made.finish()  # type: ignore[no-untyped-call]
-    with path.open("rb") as file, open_recording(path) as recording:
+    with path.open("rb") as file:
         told = [
-            (topic.topic, message.data)
+            (topic.topic, message.data, message.log_time)
             for _, topic, message in NonSeekingReader(file).iter_messages(log_time_order=False)
         ]
+    frames = [
+        file_format.unpack_frame(data, (first, second).index(topic))
+        for topic, data, _ in told
+        if topic in (first, second)
+    ]
+    in_force, timeline = defaultdict[int, list[InForce]](list), Timeline()
+    items, begins = list[Any](), dict[int, InForce]()
+    for topic, data, at_ns in told:
+        if topic in (first, second):
+            items.append(file_format.unpack_frame(data, (first, second).index(topic)))
+            in_force[items[-1].sensor].append(timeline[items[-1].sensor])
+        elif topic in notes:
+            said = file_format.unpack_json(data, topic)
+            items.append((RecordedEvent, RecordedDescription)[topic == notes[1]](at_ns, said))
+            if topic == notes[1]:
+                for now in timeline.describe(said):
+                    begins.setdefault(now.sensor, now)
+            elif said.get("source") != "recorder":
+                for now in timeline.event(said):
+                    begins.setdefault(now.sensor, InForce(SensorInfo(now.sensor)))
+            elif said["event"] == "connected":
+                timeline.connected({})
+    if is_wrong := has_index and seed % 2 > 0:
+        path.write_bytes(with_fewer_in_index(path.read_bytes(), draw))
+    with open_recording(path) as recording:
+        assert (recording.cut_off, REWRITTEN in recording.remarks) == (None, seed % 4 == 0)
+        assert recording.chosen == ({0, 7, 12} if seed % 4 else set())
+        assert [*recording.everything()] == items
+        assert recording.events == [each for each in items if isinstance(each, RecordedEvent)]
+        counts = [sum(each.sensor == sensor for each in frames) for sensor in (0, 1)]
+        assert [each.sensor for each in recording.sensors] == [0, 1]
+        if not is_wrong:
+            assert [each.frames for each in recording.sensors] == counts
+            assert recording.frame_count == sum(counts)
         for sensor in (0, 1):
-            own = [file_format.unpack_frame(data, sensor) for topic, data in told if topic == topics[sensor]]
+            own = [each for each in frames if each.sensor == sensor]
             assert str(recording.columns(sensor)) == str(columns(own))
             assert list(recording.frames(sensor)) == own
-        tables = [each for each in recording.tables() if not isinstance(each, RecordedEvent)]
-        numbers = [int(row) for each in tables for row in cast(Any, each)["sequence"]]
-        assert numbers == [each.sequence for each in recording.frames()]
-        assert [each.event for each in recording.events] == [
-            file_format.unpack_json(data, topic) for topic, data in told if topic == topics[2]
-        ]
+            # What a description tells first was in force before it.
+            told_first = begins.get(sensor, InForce(SensorInfo(sensor)))
+            expected = [each if each.is_described else told_first for each in in_force[sensor]]
+            batches = [(now, part.sequence.tolist()) for now, part in recording.batches(sensor)]
+            assert [number for _, part in batches for number in part] == [each.sequence for each in own]
+            assert [now for now, part in batches for _ in part] == expected
+        assert [*recording.batches(7)] == []
+        tables = [each for each in recording.tables() if isinstance(each, np.ndarray)]
+        numbers = [int(row) for each in tables for row in each["sequence"]]
+        assert numbers == [each.sequence for each in frames]
+
+
+def with_fewer_in_index(data: bytes, draw: random.Random) -> bytes:
+    """As of a writer whose message indexes are shorter than their records."""
+    found, position = bytearray(data), 8
+    while found[position] != 0x0F:
+        opcode, length = struct.unpack_from("<BQ", found, position)
+        if opcode == 0x07:
+            (size,) = struct.unpack_from("<I", found, position + 11)
+            struct.pack_into("<I", found, position + 11, 16 * draw.randrange(size // 16 + 1))
+        position += 9 + length
+    return bytes(found)
 
 
 @pytest.mark.parametrize("size", [61, 77])
