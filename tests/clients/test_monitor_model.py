@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+import random
 import re
 from functools import partial
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 from unittest import mock
 
 import pytest
 
 from bota_clients.errors import RecordingError
+from bota_clients.monitor import model as model_module
 from bota_clients.monitor.compensated import NewestCompensated
-from bota_clients.monitor.model import Model, SensorView
+from bota_clients.monitor.model import Message, Model, Percentiles, SensorView
 from bota_clients.monitor.reader import MonitorReader
 from bota_clients.monitor.screen import ViewOptions, render, table
 from bota_clients.monitor.words import json_line, json_object, verdict
@@ -22,7 +24,8 @@ from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from bota_ethercat.control import Event
 from bota_ethercat.framing import DataFlag, DataMessage
-from bota_ethercat.health.limits import LIMITS, Level
+from bota_ethercat.health.limits import LIMITS, About, Finding, Level
+from bota_ethercat.health.limits import verdict as made_verdict
 from bota_ethercat.pdo import STANDARD_GRAVITY, ImuUnits
 from bota_ethercat.stream.timeline import Timeline
 from tests.clients import monitor_states as made
@@ -63,24 +66,6 @@ def peaks(sensor: SensorView) -> list[tuple[float, ...]]:
 
 def texts(sensor: SensorView) -> list[str]:
     return [alert.text for alert in sensor.alerts]
-
-
-def test_a_peak_of_one_sample_is_held(model: Model) -> None:
-    spike = frame(20, {**REST, "force.x": 55.0, "torque.z": -3.0})
-    sensor = take(model, *run(0, 20), spike, *run(21, 20))
-    assert sensor.sample is not None
-    assert sensor.sample.force == (0.0, 0.0, -8.0)
-    assert peaks(sensor) == [(0, 55), (0, 0), (-8, -8), (0, 0), (0, 0), (-3, 0)]
-
-
-def test_repeated_invalid_and_not_finite_values_hold_no_peak(model: Model) -> None:
-    high = {**REST, "force.x": 99.0, "warnings": 0x7F}
-    kinds = DataFlag.REPEATED, DataFlag.INVALID, DataFlag.INVALID | DataFlag.REPEATED
-    bad = frame(4, {**REST, "force.z": math.nan}), frame(5, {**REST, "torque.x": math.inf})
-    old = (frame(k, high, flags=f) for k, f in enumerate(kinds, start=1))
-    sensor = take(model, frame(0, REST), *old, *bad)
-    assert (sensor.samples, sensor.repeated, sensor.invalid) == (3, 1, 2)
-    assert peaks(sensor) == [(0, 0), (0, 0), (-8, -8), (0, 0), (0, 0), (0, 0)]
 
 
 @pytest.mark.parametrize("silent", [False, True])
@@ -132,39 +117,14 @@ def test_a_new_connection_is_no_loss_and_keeps_the_peaks_of_the_same_sensor(mode
     assert only(model, now(10)).peaks is None, "another sensor"
 
 
-@pytest.mark.parametrize("tared", [True, False])
-def test_a_tare_and_a_reset_forget_the_peaks_and_a_reset_past_warnings(model: Model, tared: bool) -> None:
-    take(model, *run(0, 10, **{"force.x": 7.0, "warnings": 8}))
-    if tared:
-        made.happen(model, {"event": Event.OFFSET_CHANGED, "sensor": 0, "offset": [1.0] * 6}, now(10))
-    else:
-        model.reset()
-    sensor = take(model, *run(10, 10))
-    assert peaks(sensor)[0] == (0, 0)
-    assert texts(sensor) == (["ADC out of sync"] if tared else [])
-
-
-def test_of_another_sensor_nothing_is_known_of_the_one_before(model: Model) -> None:
-    sensor = take(model, *run(0, 10, **{"force.x": 7.0, "warnings": 8}))
-    assert (sensor.sample is None, sensor.peaks is None, len(sensor.alerts)) == (False, False, 1)
-    made.describe(model, description(), now(10))
-    sensor = only(model, now(10))
-    assert (sensor.sample is None, sensor.peaks is None, len(sensor.alerts)) == (False, False, 1), "the same"
-    other = description()
-    other["sensors"][0]["serial"] += 1
-    made.describe(model, other, now(10))
-    sensor = only(model, now(10))
-    assert (sensor.sample, sensor.peaks, sensor.alerts) == (None, None, ())
-    sensor = take(model, *run(10, 1))
-    assert peaks(sensor)[0] == (0, 0)
-
-
 def test_a_replay_is_told_from_a_server(model: Model) -> None:
     assert model.state(now(0)).server.replay == ""
     made.connect(model, {**description(), "replay": {"files": ["run.mcap"]}}, made.OWN_PEER, now(0))
     state = model.state(now(0))
     assert state.server.replay == "run.mcap"
     assert "REPLAY run.mcap" in render(state, ViewOptions(), 80).head[0].plain
+    made.connect(model, {**description(), "replay": {"files": []}}, made.OWN_PEER, now(0))
+    assert model.state(now(0)).server.replay == "a recording"
 
 
 def test_a_warning_of_one_sample_is_present_for_a_while_and_then_follows_present_ones(
@@ -238,51 +198,12 @@ def test_a_short_time_unread_is_no_reason_for_silence(model: Model, unread_s: fl
     assert texts(only(model, now(9) + 0.9)) == [f"No new sample for 0.9 s, {why}"]
 
 
-def test_what_is_past_is_told_at_its_worst_and_at_its_last_time(model: Model) -> None:
-    at = 0
-    for lost in (0, 40, 7):  # then more than a second in which none is
-        at += lost
-        for _ in range(20):
-            take(model, *run(at, 50))
-            at += 50
-    (alert,) = only(model, now(at)).alerts
-    assert re.match(r"40 of \d+ samples .* were lost", alert.text)
-    assert alert.ago_s == pytest.approx(0.25, abs=0.1)
-
-
-def test_what_was_trouble_is_told_as_that_however_little_is_wrong_later(model: Model) -> None:
-    """A rate, which has no size."""
-    moment, number = frame(0).monotonic_ns, 0
-    for periods in (2.0, 1.05, 1.0):
-        for _ in range(40):
-            frames = list[DataMessage]()
-            for _ in range(50):
-                moment, number = moment + round(periods * made.PERIOD_NS), number + 1
-                frames.append(frame(number, REST)._replace(monotonic_ns=moment))
-            at_s = now(0) + (moment - frame(0).monotonic_ns) * 1e-9
-            model.add_frames(frames, at_s)
-        if periods > 1:
-            (alert,) = only(model, at_s).alerts
-            assert (alert.level, alert.ago_s) == (Level.TROUBLE if periods > 1.5 else Level.LOOK, None)
-    (alert,) = only(model, at_s).alerts
-    assert alert.ago_s
-    assert alert.level is Level.TROUBLE
-
-
-def test_the_latest_of_what_is_past_and_the_worst_of_what_is_present_come_first(model: Model) -> None:
+def test_the_worst_of_what_is_present_comes_first(model: Model) -> None:
     model.connected(description(("BFT-SENS-ECAT-M8",) * 2), made.OWN_PEER, START_S)
-    hot: dict[str, float] = {"temperature": LIMITS.temperature_warn + 1}
-    seconds: list[dict[str, float]] = [hot, {"warnings": 0b1000}, {}, hot]
     overload = {**REST, "warnings": 0b10001, "force_torque_saturated": 4}
-    for at, values in enumerate(seconds):
-        for first in range(at * 1000, at * 1000 + 1000, 100):
-            others = [frame(k, overload if at == 3 else REST, sensor=1) for k in range(first, first + 100)]
-            model.add_frames([*run(first, 100, **values), *others], now(first + 99))
-        if at == 2:
-            past = [alert.ago_s for alert in model.state(now(2999)).sensors[0].alerts]
-            assert past == sorted(past, key=lambda ago_s: ago_s or 0)
-            assert len(set(past)) > 1
-    level, text = verdict(model.state(now(3999)))
+    hot = run(0, 100, temperature=LIMITS.temperature_warn + 1)
+    model.add_frames([*hot, *(frame(k, overload, sensor=1) for k in range(100))], now(99))
+    level, text = verdict(model.state(now(99)))
     assert level > Level.LOOK
     assert re.match("sensor 1: .*saturated.*; sensor 0: .*°C", text)
 
@@ -372,59 +293,6 @@ def test_what_came_before_a_tare_is_no_peak_after_it(model: Model) -> None:
         assert peaks(only(fresh, now(3)))[0] == (0.5, 0.5), cut
 
 
-def test_the_servers_clients_have_rates_and_one_of_them_is_this(model: Model) -> None:
-    model.add_status(status(sent=1000), START_S + 1)
-    assert [client.rate_hz for client in model.state(START_S + 1).clients] == [None, None]
-    model.add_status(status(sent=2600), START_S + 3)
-    state = model.state(START_S + 4)
-    this, other = state.clients
-    assert (this.this, this.rate_hz, this.withheld) == (True, 800, 0)
-    assert (other.this, other.rate_hz, other.withheld) == (False, 3200, 12)
-    assert state.server.uptime_s == 4568
-
-
-def test_what_is_known_of_the_server_is_that_of_its_last_connection() -> None:
-    model, spread = Model("here:1"), {"p50": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0}
-
-    def known(at_s: float) -> tuple[object, ...]:
-        state = model.state(at_s)
-        server = state.server
-        return server.connected, server.reason, server.since_s, server.heard_s, server.uptime_s, server.silent
-
-    model.gone("no server answers", 1.0)
-    assert known(3.0) == (False, "no server answers", 2.0, None, None, False)
-    made.connect(model, description(), made.OWN_PEER, 10.0)
-    assert known(10.25) == (True, "", 0.25, 0.25, None, False)
-    rows = [{"peer": peer, "sent": sent, "withheld": lost} for peer, sent, lost in CLIENTS]
-    model.add_status({**status(), "last_10s": {}, "wake_us": spread, "clients": rows}, 11.0)
-    assert known(11.5) == (True, "", 1.5, 0.5, 4567.5, True)
-    state = model.state(11.5)
-    assert [client.peer for client in state.clients] == [made.OWN_PEER, "c", "b", "a"]
-    assert (state.server.wake_us and state.server.wake_us[:2], state.server.exchange_us) == ((1.0, 2.0), None)
-    model.note_unread(0.0, False, 11.0)
-    assert known(11.75)[3] == 0.0, "until somebody has looked"
-    for _ in range(10):
-        model.add_event({"event": Event.SHUTTING_DOWN}, 12.0)
-    assert (known(12.25)[3], len(model.state(12.25).events)) == (0.0, 8)
-    for at_s, why in ((20.0, "it ended"), (25.0, "refused")):
-        model.gone(why, at_s)
-    assert known(26.0) == (False, "refused", 6.0, None, 4567.0, False)
-    assert model.state(26.0).clients == ()
-    made.connect(model, {**description(), "replay": {}}, made.OWN_PEER, 30.0)
-    assert model.state(30.0).server.replay == "a recording"
-    assert known(30.0) == (True, "", 0.0, 0.0, None, False)
-
-
-CLIENTS = (("a", 5, 0), ("b", 9, 0), ("c", 1, 7), (made.OWN_PEER, 0, 0))
-
-
-def test_a_message_goes_after_half_a_minute(model: Model) -> None:
-    model.say("Recorded 1 sample")
-    assert [bool(model.state(now(0) + at_s).message) for at_s in (0, 29.9, 30.1)] == [True, True, False]
-    model.say("Not tared")
-    assert model.state(now(41 * 1000)).message is not None
-
-
 TOOL = {
     "tool_mass": 0.8, "tool_center_of_gravity": [0.0, 0.0, 0.05], "bias": [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
     "sensor_offset": [0.0] * 6, "contact.surface": "plane 0 0 0.1 0 0 1 0.03",
@@ -488,3 +356,148 @@ def test_what_cannot_be_compensated_is_told() -> None:
     )
     with pytest.raises(RecordingError, match=r"contact.surface is 'box'"):
         NewestCompensated(TOOL | {"contact.surface": "box"}, ImuUnits.G_DPS)
+
+
+def finding(key: str, level: Level, size: float) -> Finding:
+    return Finding(level, About.STREAM, key, f"{key} {level} {size}", "Look", size)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_any_course_of_events_comes_to_what_it_is_by_definition(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All that happened is kept here, and looked through anew each time."""
+    draw, model, at_s = random.Random(seed), Model(made.ADDRESS), START_S
+    here: list[Finding] = []  # what is found at the moment
+    monkeypatch.setattr(model_module, "judge", lambda _: made_verdict(here))
+    monkeypatch.setattr(model_module, "clock_text", lambda: "12:00:00")
+    monkeypatch.setattr(model_module, "event_sentence", lambda event: event["offset"][0])
+    wrenches: dict[int, list[tuple[float, ...]]] = {}  # since the reset, by sensor
+    found: dict[int, list[tuple[float, Finding]]] = {}
+    newest: dict[int, tuple[float, ...] | None] = {}
+    statuses: list[tuple[float, dict[str, int]]] = []
+    described, connected, since, heard, reason = 0, False, None, 0.0, ""
+    spread, serial = dict[str, float](), 1
+    read_s, said, shown_s, events, numbers, tared = math.inf, "", 0.0, list[str](), [0, 0, 0], False
+    for _ in range(150):
+        at_s += draw.choice((0.0, 0.01, 0.1, 0.2, 0.45, 0.49, 0.5, 0.6, 7.0, 31.0))
+        here[:] = [
+            finding(key, draw.choice((Level.LOOK, Level.TROUBLE)), draw.randrange(3))
+            for key in draw.sample("abc", draw.choice((0, 0, 1, 2)))
+        ]
+        here.sort(key=lambda each: -each.level)
+        what = draw.choice(
+            ("frames",) * 6 + ("status", "status", "tare", "say", "gone", "connect", "reset", "read")
+        )
+        if what == "connect":
+            described = draw.choice((1, 2))
+            known = description(("BFT-SENS-ECAT-M8",) * described)
+            if draw.random() < 0.3:  # another sensor
+                serial += 2
+                for kept in (wrenches, found, newest):
+                    kept.pop(0, None)
+            known["sensors"][0]["serial"] = serial
+            made.connect(model, known, made.OWN_PEER, at_s)
+            connected, since, heard, reason = True, at_s, at_s, ""
+            wrenches = {n: wrenches.get(n, []) for n in range(described)}
+            found = {n: found.get(n, []) for n in range(described)}
+            if tared:  # which this server does not tell
+                wrenches[0], tared = [], False
+            newest, statuses = {n: newest.get(n) for n in range(described)}, []
+        elif what == "gone":
+            since = at_s if connected or since is None else since
+            reason = draw.choice(("it ended", "refused"))
+            connected, statuses = False, [(at, {}) for at, _ in statuses[-1:]]
+            model.gone(reason, at_s)
+        elif what == "frames":
+            frames = list[DataMessage]()
+            for _ in range(draw.randrange(5)):
+                position, flags = draw.randrange(3), draw.choice((0, 0, 0, REPEATED, INVALID))
+                numbers[position] += 1
+                six = tuple(
+                    draw.choice((draw.randrange(-9, 9), math.nan if axis else 1)) for axis in range(6)
+                )
+                values = dict(zip(SIX, six, strict=True))
+                frames.append(frame(numbers[position], values, sensor=position, flags=flags))
+                if position < described:
+                    found[position] += [(at_s, each) for each in here]
+                    if not flags:
+                        wrenches[position].append(six)
+                        newest[position] = six
+            heard = at_s if frames else heard
+            model.add_frames(frames, at_s)
+        elif what == "status" and connected:
+            rows = {peer: draw.randrange(9999) for peer in draw.sample(("a", "b", made.OWN_PEER), 2)}
+            told = [{"peer": peer, "sent": sent, "withheld": sent % 3} for peer, sent in rows.items()]
+            spread = {"p50": float(sent), "p99": 9.0} if (sent := draw.choice((0, 7))) else {}
+            recent = {"last_10s": {"exchange_us": {"p50": 1.0, "p99": 2.0}}}
+            more = {"wake_us": spread, "exchange_us": spread, "clients": told}
+            model.add_status({**status(described), **recent, **more}, at_s)
+            statuses, heard = [*statuses, (at_s, rows)], at_s
+        elif what == "tare" and connected and described:
+            offset = [draw.random()] * 6
+            made.happen(model, {"event": Event.OFFSET_CHANGED, "sensor": 0, "offset": offset}, at_s)
+            heard, events = at_s, [*events, f"12:00:00 {offset[0]}"]
+            wrenches[0], tared = [], True
+        elif what == "say":
+            said, shown_s = f"12:00:00 {at_s}", 0.0
+            model.say(f"{at_s}", said.endswith("0"))
+        elif what == "reset":
+            wrenches, found = {n: [] for n in range(described)}, {n: [] for n in range(described)}
+            model.reset()
+        elif what == "read":
+            read_s = at_s
+            model.note_unread(0.0, False, at_s)
+        if draw.random() < 0.3:
+            continue
+        state = model.state(at_s)
+        server = state.server
+        shown_s = shown_s or at_s + 30
+        said = said if at_s <= shown_s else ""
+        assert state.message == (Message(said, said.endswith("0")) if said else None)
+        assert [*state.events] == events[-8:]
+        heard_s = max(min(at_s, read_s) - heard, 0.0) if connected else None
+        assert (server.connected, server.reason, server.heard_s) == (connected, reason, heard_s)
+        assert server.since_s == (None if since is None else at_s - since)
+        speaks = heard_s is not None and heard_s < 0.5
+        assert server.silent == (connected and not speaks)
+        if connected:
+            assert server.exchange_us == (Percentiles(1.0, 2.0) if statuses else None)
+            assert server.wake_us == (Percentiles(spread["p50"], 9.0) if statuses and spread else None)
+        uptime = 4567.0 + (at_s - statuses[-1][0] if connected else 0.0) if statuses else None
+        assert server.uptime_s == (None if uptime is None else pytest.approx(uptime))
+        clients = []
+        if connected and statuses:
+            passed = statuses[-1][0] - statuses[-2][0] if len(statuses) > 1 else 0
+            before = statuses[-2][1] if len(statuses) > 1 else {}
+            for peer, sent in statuses[-1][1].items():
+                rate = (sent - before[peer]) / passed if peer in before and passed else None
+                clients.append((peer, peer == made.OWN_PEER, rate, sent, sent % 3))
+        assert [*map(tuple, state.clients)] == sorted(
+            clients, key=lambda each: (not each[1], -each[4], -each[3])
+        )
+        assert [sensor.position for sensor in state.sensors] == [*range(described)]
+        for number, view in enumerate(state.sensors):
+            if speaks:
+                found[number] += [(at_s, each) for each in here]
+            finite = [[*filter(math.isfinite, axis)] for axis in zip(*wrenches[number], strict=True)]
+            extremes = [(min(axis, default=0.0), max(axis, default=0.0)) for axis in finite] or None
+            assert (view.peaks and [*map(tuple, view.peaks)]) == extremes
+            last, read = newest.get(number), view.sample and (*view.sample.force, *view.sample.torque)
+            assert read == (last and pytest.approx(last, nan_ok=True))
+            past = dict[str, tuple[float, Finding]]()
+            for when, each in found[number]:
+                worst = past[each.key][1] if each.key in past else each
+                past[each.key] = when, max(each, worst, key=lambda one: (one.level, one.size))
+            present = {each.key: each for each in here if speaks}
+            alerts: list[Any] = [(each.level, each.found, None) for each in present.values()]
+            alerts += [
+                (each.level, each.found, at_s - when)
+                for key, (when, each) in sorted(past.items(), key=lambda entry: -entry[1][0])
+                if key not in present
+            ]
+            assert [(each.level, each.text, each.ago_s) for each in view.alerts] == alerts
+
+
+REPEATED, INVALID = int(DataFlag.REPEATED), int(DataFlag.INVALID)
+SIX = tuple(f"{name}.{axis}" for name in ("force", "torque") for axis in "xyz")

@@ -160,7 +160,8 @@ class _Sensor:
 
     def __init__(self, position: int, imu_units: ImuUnits, compensated: NewestCompensated | None) -> None:
         self.position, self.compensated = position, compensated
-        self.peaks: tuple[Range, ...] | None = None
+        # Lowest and highest of each axis since the reset; empty of one that was never finite.
+        self.peaks: tuple[tuple[float, ...], ...] | None = None
         self._imu_units = imu_units
         self.observer = StreamObserver(0.0, 0, window_ns=_WINDOW_NS)
         self._hand_out = DistributionStatus()
@@ -247,7 +248,7 @@ class _Sensor:
             status=status,
             al_state="LOST" if lost is not None else info.state,
             sample=sample or None,
-            peaks=self.peaks,
+            peaks=tuple(Range(*(each or (0.0, 0.0))) for each in self.peaks) if self.peaks else None,
             saturated=self._saturated,
             verdict=self._verdict,
             alerts=tuple(alerts),
@@ -421,10 +422,10 @@ def clock_text() -> str:
     return time.strftime("%H:%M:%S")
 
 
-def _range(column: Sequence[float]) -> Range:
+def _range(column: Sequence[float]) -> tuple[float, ...]:
     if not math.isfinite(sum(column)):
-        column = [value for value in column if math.isfinite(value)] or [0.0]
-    return Range(min(column), max(column))
+        column = [value for value in column if math.isfinite(value)]
+    return (min(column), max(column)) if column else ()
 
 
 def _percentiles(known: DistributionStatus) -> Percentiles | None:
