@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import itertools
+import json
 import os
 import re
 import signal
@@ -18,6 +19,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -310,6 +312,99 @@ with contextlib.redirect_stderr(sys.stdout):
     print(main(["near0", "--exit-on-eof", "--control", f"/tmp/control-{os.getpid()}"]))
 """
 
+SEEN = """
+import dataclasses
+import json
+import subprocess
+from ethercat_server.ethercat.nic import IFF_PROMISC, change_flags, find_routes, interfaces, look_up
+
+def ip(*words):
+    return json.loads(subprocess.run(["ip", "-json", *words], check=True, stdout=-1).stdout)
+
+other = subprocess.Popen(["unshare", "--net", "bash", "-c", "echo; read"], stdin=-1, stdout=-1)
+other.stdout.readline()
+commands = '''link set lo up; link add near0 type veth peer far0
+link add away0 mtu 1400 type veth peer hidden0 netns PID; link add bridge0 type bridge
+link set far0 master bridge0; link add idle0 type veth peer idle1
+link property add dev idle0 altname so-long-that-it-is-no-name
+link add link near0 name upper0 type macvlan; link set near0 up; link set far0 up; link set upper0 up
+address add 192.0.2.9/30 dev near0; address add fe80::9/64 dev near0 nodad
+address add fe80::1/64 dev near0 nodad; address add 2001:db8::7/64 dev near0 nodad
+address add 192.0.2.5/30 dev near0 valid_lft 600 preferred_lft 600
+address add 198.51.100.1 peer 198.51.100.9/32 dev upper0; route add 10.1.0.0/16 dev near0
+route add 10.2.0.0/16 via 192.0.2.10; route add 10.3.0.0/16 dev upper0 table 9
+route add 10.4.0.0/16 dev far0; route add local 10.5.0.0/16 dev near0
+-6 route add fd01::/16 via fe80::5 dev near0
+route add 10.6.0.0/16 nexthop via 198.51.100.9 dev upper0 nexthop dev near0'''
+for line in commands.replace("PID", str(other.pid)).replace("\\n", "; ").split("; "):
+    subprocess.run(["ip", *line.split()], check=True)
+made = [{**dataclasses.asdict(row), **find_routes(row.ifindex)._asdict()} for row in interfaces()]
+table = [row for family in ("-4", "-6") for row in ip(family, "route", "show", "table", "all")]
+print(json.dumps([made, ip("-details", "link"), ip("address"), table], default=lambda each: each.hex()))
+index = look_up("so-long-that-it-is-no-name").ifindex
+steps = [{way: IFF_PROMISC} for way in ("on", "on", "off", "off")]
+print(json.dumps([(change_flags(index, **step), ip("link", "show", "idle0")[0]["flags"]) for step in steps]))
+other.communicate()
+"""
+
+
+def test_what_is_seen_of_interfaces_is_what_ip_shows() -> None:
+    """Of a bridge, a VLAN and pairs of which one end is elsewhere; of addresses and routes of every kind."""
+    looked = completed("unshare", "--net", sys.executable, "-c", SEEN)
+    assert looked.returncode == 0, looked.stderr
+    whole, flags = looked.stdout.splitlines()
+    made, links, addresses, table = json.loads(whole)
+    index = {row["ifname"]: row["ifindex"] for row in links}
+    own = {row["ifname"]: row["addr_info"] for row in addresses}
+    assert [row["name"] for row in made] == [row["ifname"] for row in links]
+    for row, link in zip(made, links, strict=True):
+        name, has = link["ifname"], link["flags"]
+        its = own[name]
+        text = {id(each): f"{each['local']}/{each['prefixlen']}" for each in its}
+        local = [text[id(each)] for each in its if each["scope"] == "link"]
+        carried = {name, "upper0"} if name == "near0" else {name}
+        routes = {
+            each["dst"] + ("/128" if ":" in each["dst"] and "/" not in each["dst"] else ""): "gateway" in hop
+            for each in table
+            for hop in each.get("nexthops", [each])
+            if {**each, **hop}.get("dev") in carried
+            and each.get("type", "unicast") == "unicast"
+            and each.get("protocol") != "kernel"
+        }
+        assert row == {
+            "name": name, "ifindex": link["ifindex"], "up": "UP" in has, "loopback": "LOOPBACK" in has,
+            "carrier": "LOWER_UP" in has and link["operstate"] in ("UP", "UNKNOWN"), "mtu": link["mtu"],
+            "master_index": index.get(link.get("master"), 0), "address": link["address"].replace(":", ""),
+            "kind": link.get("linkinfo", {}).get("info_kind", ""), "ethernet": link["link_type"] == "ether",
+            "link": link.get("link_index") or index.get(link.get("link"), 0),
+            "namespace": row["namespace"] if name == "away0" else "",
+            "stats": row["stats"], "xdp": [], "default": False, "link_local": sorted(local),
+            "addresses": [text[id(each)] for each in its if each["scope"] != "link"],
+            "leased": [text[id(each)] for each in its if each.get("dynamic") and each["scope"] != "link"],
+            "others": [*routes], "beyond": [each for each, gateway in routes.items() if gateway],
+        }  # fmt: skip
+        assert (len(row["namespace"]), row["stats"] != "") == (8 * (name == "away0"), True)
+    told = [(number, "PROMISC" in has) for number, has in json.loads(flags)]
+    assert told == [(0x1002, True), (0x1102, True), (0x1102, False), (0x1002, False)]
+
+
+@pytest.mark.parametrize(
+    ("after_s", "said"), [(0.0, ""), (4.95, ""), (5.05, "near0 has no carrier: "), (99, "near0 is ")]
+)
+def test_a_link_that_was_just_brought_up_is_waited_for(
+    after_s: float, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = [1000.0]
+    clock = SimpleNamespace(monotonic=lambda: now_s[0], sleep=lambda s: now_s.append(now_s.pop() + s))
+    monkeypatch.setattr(nic, "time", clock)
+    monkeypatch.setattr(
+        nic, "look_up", lambda _: nic.Interface("near0", 7, after_s < 99, carrier=now_s[0] - 1000 >= after_s)
+    )
+    with pytest.raises(InterfaceError, match=said) if said else contextlib.nullcontext():
+        nic._wait_usable("near0")
+    assert now_s[0] - 1000 == pytest.approx(min(after_s, 5.0) % 99 if after_s < 99 else 0.0, abs=0.03)
+
+
 # As routing daemons set it: routes do not say where their next hops are.
 UNSEEN = "echo 0 >/proc/sys/net/ipv4/nexthop_compat_mode"
 
@@ -594,8 +689,13 @@ def another(ifname: str) -> Iterator[subprocess.Popen[str]]:
         yield process
 
 
-def test_the_process_that_has_the_interface_is_named_until_it_ends_in_any_way(veth: Veth) -> None:
-    with another(veth.near) as process:
+def test_the_process_that_has_the_interface_is_named_until_it_ends_in_any_way(
+    veth: Veth, tmp_path: Path
+) -> None:
+    before, after = ((tmp_path / name).open("w") for name in "ab")
+    fcntl.flock(before, fcntl.LOCK_EX)
+    with before, after, another(veth.near) as process:
+        fcntl.flock(after, fcntl.LOCK_EX)
         name = Path(f"/proc/{process.pid}/comm").read_text().strip()
         expected = f"{veth.near} is in use by another EtherCAT master, process {process.pid} ({name}): stop"
         if os.access(nic.DIRECTORY, os.W_OK):

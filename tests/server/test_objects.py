@@ -298,6 +298,17 @@ def test_each_request_is_done_once_whatever_counter_another_master_left(
     assert set(slave.counters) == set(range(2, 8)), "SOEM's mapping begins with 1, where the bus comes up"
 
 
+def test_the_answer_to_a_read_that_was_given_up_is_not_that_to_the_next() -> None:
+    slave = CountingSlave(0.0, 0.0)
+    sdo = MailboxSdo(cast(Bus, slave), 0, MAILBOXES)
+    for reading_s in (0.0, 3.0):
+        slave.takes_s[0x40] = reading_s
+        with pytest.raises(SetUpError) if reading_s else contextlib.nullcontext():
+            finish(sdo.read(0x8001, 1), slave.clock)
+    slave.takes_s[0x40], done = 0.0, slave.done
+    assert int.from_bytes(finish(sdo.read(0x8001, 1), slave.clock), "little") > done
+
+
 def test_one_transfer_waits_for_the_other() -> None:
     slave, read = CountingSlave(0.01, 0.01), list[int]()
     sdo = MailboxSdo(cast(Bus, slave), 0, MAILBOXES)
@@ -360,7 +371,7 @@ def test_an_answer_about_another_object_is_left_alone_and_a_refusal_is_not() -> 
 
 @pytest.mark.parametrize(("code", "words"), [(0x06020000, "does not exist"), (0x12345678, "does not define")])
 def test_a_refusal_says_why_in_words_and_as_a_number(code: int, words: str) -> None:
-    bus = GivenBus((ABORTED, 0x8001, struct.pack("<I", code)))
+    bus = GivenBus((ABORTED, 0x8001, struct.pack("<II", code, 7)))
     with pytest.raises(SdoAbortError, match=rf"sensor 0 refused writing .*{words} \(abort 0x{code:08X}\)"):
         finish(mailbox(bus).write(0x8001, 1, b"efgh"))
 
@@ -621,6 +632,9 @@ def test_emergencies_are_told_at_a_bounded_rate_and_all_are_counted(caplog: pyte
     assert note(0x5011) == [(1, 0x5011, 14)]
     clock.sleep(100.0)
     assert len(note(*range(0x6000, 0x6009))) == 5
+    texts = [Emergency(code, 0, b"").text for code in (0x00FF, 0x5123, 0x8FFF, 0x81FF, 0xB001)]
+    hardware, none = "hardware of the device", "of no class that CiA 301 defines"
+    assert texts == ["error reset, or no error", hardware, "monitoring", "communication", none]
     clock.sleep(1.2344)
     last = {"code": 0x6008, "text": "software of the device", "register": 0x81, "data": "0102"}
     assert known.status(1) == {"emergencies": 23, "emergency": {**last, "ago_s": 1.234}}
