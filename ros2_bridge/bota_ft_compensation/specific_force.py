@@ -157,7 +157,7 @@ class QuaternionGravity:
         self._rates: deque[tuple[float, Vector3]] = deque(maxlen=_MOST_RATES)
 
     def reset(self) -> None:
-        self._newest_s, self._gravity = -math.inf, None
+        self._newest_s = -math.inf
         self._rates.clear()
 
     def add_rate(self, angular_rate: Vector3, time_s: float) -> None:

@@ -251,7 +251,7 @@ def left_over(
     return Left(found[:, 0], found[:, 1:4], found[:, 4:7], turnings, found[:, 7:])
 
 
-def tensor(inertia: tuple[float, ...]) -> Array:
+def tensor(inertia: tuple[float, ...] | Array) -> Array:
     xx, yy, zz, xy, xz, yz = inertia
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 

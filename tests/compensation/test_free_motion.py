@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+import re
 from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ft_compensation.alignment import align
-from bota_ft_compensation.identification.free_motion import identify_in_motion
-from bota_ft_compensation.identification.inertia import turn
-from bota_ft_compensation.identification.payload import Identified
-from bota_ft_compensation.quantities import EXACT, CompensationError, likely_inertia
+from bota_ft_compensation.identification.free_motion import (
+    _Answer,
+    _known,
+    _left,
+    _Model,
+    _noise,
+    _steiner,
+    _together,
+    identify_in_motion,
+)
+from bota_ft_compensation.identification.inertia import Turned, crossing, turn
+from bota_ft_compensation.identification.payload import Identified, Joint
+from bota_ft_compensation.quantities import EXACT, CompensationError, Payload, likely_inertia
 from tests.compensation import motion
 from tests.compensation.making import BIAS, SEED, check_coverage
-from tests.compensation.motion import IMU, Felt, imperfect, settings, tool_of
+from tests.compensation.motion import IMU, Array, Felt, imperfect, settings, tensor, tool_of
 from tests.compensation.test_inertia import RATE_HZ, path_of, recorded
 from tests.simulation import more_if_long
 
@@ -108,7 +122,8 @@ def test_a_touch_is_left_out_and_hardly_any_motion_is_refused() -> None:
     found = identified(part_of_the_time(recorded("turned", SEED + 6, tool), 0.2))
     assert found.payload.mass == pytest.approx(tool.mass, abs=0.01)
     assert found.payload.center == pytest.approx(tool.center, abs=4e-4)
-    assert [note.split(" in ")[0] for note in found.notes[1:]] == ["something touched the tool"]
+    told = re.sub("[23]. %", "SHARE", found.notes[1])
+    assert told == "something touched the tool in SHARE of the time, which is left out"
     with pytest.raises(CompensationError, match=r"do not suffice.*about each axis|cannot be told from zero"):
         identified(recorded("still", SEED + 6, tool))
     found = identified(recorded("about x", SEED + 6, tool))
@@ -127,29 +142,155 @@ def test_a_touch_of_any_force_is_left_out(times: float) -> None:
     assert found.mass_interval < 0.01
 
 
-def test_the_center_of_a_heavy_tool_is_known_better() -> None:
-    """Its interval is that of the moment by the mass."""
-    light, heavy = (
-        identified(recorded("turned", SEED + 6, tool_of(SEED + 6, mass=mass))).payload.center_interval
-        for mass in (0.5, 4.0)
-    )
-    assert np.all(np.array(heavy) < np.array(light))
+# -- step by step, against the equations of motion of one instant and their numerical derivatives
+
+X: dict[str, slice] = {
+    "mass": slice(0, 1), "moment": slice(1, 4), "tensor": slice(4, 10), "bias": slice(10, 16),
+    "drift": slice(16, 22), "offset": slice(22, 25), "scale": slice(25, 28), "crossed": slice(28, 34),
+    "gyroscope": slice(34, 43), "place": slice(43, 46), "in poses": slice(46, 52),
+}  # fmt: skip
 
 
-def test_what_is_made_of_a_sample_does_not_depend_on_where_the_recording_begins() -> None:
-    felt = recorded("turned", SEED + 6, tool_of(SEED + 6))
-    whole, part = (
-        turn(
-            felt.times[rows],
-            np.hstack([each[rows] for each in felt[1:]]),
-            align(settings(), RATE_HZ),
-            EXACT,
-            IMU,
-        )
-        for rows in (slice(None), slice(800, None))
-    )
-    rows = np.searchsorted(whole.times, part.times - 1e-6)
-    same = np.abs(whole.times[rows] - part.times) < 1e-6
-    assert same.sum() > 100
-    assert part.felt[same] == pytest.approx(whole.felt[rows][same], abs=1e-6)
-    assert part.spun[same] == pytest.approx(whole.spun[rows][same], abs=1e-6)
+class Read(NamedTuple):
+    acceleration: Array  # what an IMU reads at one instant
+    rate: Array
+    spin: Array
+    minute: float
+
+
+def wrench_of(x: Array, read: Read) -> Array:
+    """(6,) of a rigid body, N and Nm about the wrench origin, by these 52 unknowns."""
+    part = {name: x[where] for name, where in X.items()}
+    xy, xz, yx, yz, zx, zy = part["crossed"]
+    a, b, c = (read.acceleration - part["offset"]) / (1.0 + part["scale"])
+    felt = np.array([a - xy * b - xz * c, b - yx * a - yz * c, c - zx * a - zy * b])
+    true = np.eye(3) - part["gyroscope"].reshape(3, 3)
+    w, spin, place = true @ read.rate, true @ read.spin, IMU + part["place"]
+
+    def on(arm: Array) -> Array:
+        return np.asarray(np.cross(spin, arm) + np.cross(w, np.cross(w, arm)))
+
+    origin, h, inertia = felt - on(place), part["moment"], tensor(part["tensor"])
+    force = -part["mass"] * origin - on(h)
+    torque = -np.cross(h, origin) - inertia @ spin - np.cross(w, inertia @ w)
+    return np.concatenate([force, torque]) + part["bias"] + part["drift"] * read.minute
+
+
+def derivative(of: Callable[[Array], Array], x: Array) -> Array:
+    steps = 1e-6 * np.eye(len(x))
+    return np.stack([(of(x + step) - of(x - step)) / 2e-6 for step in steps], axis=-1)
+
+
+def unknowns_of(draw: np.random.Generator) -> Array:
+    x = 0.02 * draw.normal(size=52)
+    x[X["mass"]], x[X["moment"]], x[X["bias"]] = 1.5, draw.normal(size=3) * 0.1, draw.normal(size=6)
+    return np.asarray(x)
+
+
+def instants(reads: Sequence[Read]) -> Turned:
+    rate, spin = np.array([each.rate for each in reads]), np.array([each.spin for each in reads])
+    arm = crossing(spin) + crossing(rate) @ crossing(rate)
+    felt = np.array([each.acceleration for each in reads]) - arm @ np.array(IMU)
+    spun = [[tensor(row) @ s + np.cross(w, tensor(row) @ w) for row in np.eye(6)]
+            for w, s in zip(rate, spin, strict=True)]  # fmt: skip
+    nothing, times = np.zeros((len(reads), 3)), np.array([60.0 * each.minute for each in reads])
+    return Turned(nothing, nothing, felt, arm, np.moveaxis(np.array(spun), 1, 2), times)
+
+
+def test_the_design_is_that_of_the_equations_of_motion_and_all_derivatives() -> None:
+    draw = np.random.default_rng(SEED)
+    reads = [
+        Read(9.0 * draw.normal(size=3), 3.0 * draw.normal(size=3), 20.0 * draw.normal(size=3), minute / 120.0)
+        for minute in np.arange(-9.5, 10.0).tolist()
+    ]
+    x = unknowns_of(draw)
+    design, explained = _Model(instants(reads), IMU).at(x)
+    for row, read in enumerate(reads):
+        assert design[row] @ x - explained[row] == pytest.approx(wrench_of(x, read), abs=1e-9)
+        assert design[row] == pytest.approx(derivative(partial(wrench_of, read=read), x), abs=1e-6)
+
+
+def steiner(x: Array) -> Array:
+    mass, h = x[0], x[X["moment"]]
+    return np.asarray(((h @ h) * np.eye(3) - np.outer(h, h))[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] / mass)
+
+
+def test_center_and_tensor_about_it_have_the_covariance_of_what_they_are_made_of() -> None:
+    draw = np.random.default_rng(SEED)
+    x, root = unknowns_of(draw), draw.normal(size=(52, 52))
+
+    def about_center(x: Array) -> Array:
+        tensor = x[X["tensor"]] - steiner(x)
+        return np.concatenate([x[:1], x[X["moment"]] / x[0], tensor, x[10:]])
+
+    jacobian = derivative(about_center, x)
+    expected = jacobian @ root @ root.T @ jacobian.T
+    assert _together(x, root @ root.T) == pytest.approx(expected, rel=1e-5, abs=1e-5)
+    assert _steiner(x)[0] == pytest.approx(steiner(x))
+
+
+def test_what_is_left_is_what_the_covariance_makes_of_each_pose_and_turn() -> None:
+    draw, still = np.random.default_rng(SEED), np.zeros(3)
+    x, root = unknowns_of(draw), 0.01 * draw.normal(size=(52, 52))
+    x[22:46], kept = 0.0, x[X["moment"]] / x[0]
+    root[X["drift"]] = 0.0
+
+    def made(felt: Array, spin: Array) -> Array:
+        """(6, 52) of an instant at which the center of gravity feels this."""
+        felt = felt - np.cross(spin, kept - IMU)
+        found = derivative(lambda x: wrench_of(x, Read(felt, still, spin, 0.0)), x)
+        found[:, X["bias"]], found[:, X["in poses"]] = 0.0, np.eye(6)
+        return found
+
+    poses = [sign * STANDARD_GRAVITY * axis for sign in (1, -1) for axis in np.eye(3)]
+    rows = [made(each, still) for each in poses]
+    spun = [(made(still, 10.0 * axis) - made(still, still)) / 10.0 for axis in np.eye(3)]
+    pairs = [(rows[a] - rows[b]) / np.linalg.norm(poses[a] - poses[b]) for a in range(6) for b in range(a)]
+    expected = [
+        math.sqrt(np.mean([np.sum((each @ root)[part] ** 2) / 3 for each in kind]))
+        for part in (slice(3), slice(3, 6))
+        for kind in (rows, pairs, spun)
+    ]
+    answer = _Answer(x, root @ root.T, 100.0, np.zeros((1, 6)), 1.0)
+    assert _left(answer, IMU, X["in poses"]) == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_noise_of_samples_is_what_is_left_less_what_the_imu_makes() -> None:
+    draw, payload = np.random.default_rng(SEED), Payload(1.5, (0.01, 0.03, 0.2))
+    left = draw.normal(size=(500, 6)) * [0.02, 0.02, 0.002, 1e-3, 4e-3, 3e-4]
+    still = np.zeros(3)
+    turned = instants([Read(still, still, still, 0.0)])._replace(noisier=5.0, imu_noise=0.02)
+    found = _noise(turned, _Answer(np.zeros(52), np.eye(52), 1.0, left, 1.0), payload)
+    for axis, value in enumerate(found):
+        whole = 25.0 * float(np.mean(left[:, axis] ** 2))
+        arm = 1.0 if axis < 3 else math.hypot(*np.delete(payload.center, axis - 3))
+        assert value == pytest.approx(math.sqrt(max(whole - (1.5 * 0.02 * arm) ** 2, whole / 10)))
+
+
+def test_of_the_imu_is_known_before_what_is_typical_and_what_poses_say() -> None:
+    """The whole chip may be turned, by 0.03 rad about each axis: accelerometer and gyroscope alike."""
+    expected = np.diag([0.4**2] * 3 + [0.005**2] * 9 + [0.006**2] * 9 + [1.3e-3**2] * 3)
+    for row, column in itertools.product(range(3), repeat=2):
+        gyroscope = 12 + 3 * row + column
+        if row == column:
+            expected[gyroscope, gyroscope] = 0.01**2
+            continue
+        crossed, mirrored = ([(r, c) for r in range(3) for c in range(3) if r != c].index(each)
+                             for each in ((row, column), (column, row)))  # fmt: skip
+        for one, sign in ((6 + crossed, 1), (gyroscope, 1), (6 + mirrored, -1), (12 + 3 * column + row, -1)):
+            for own in (6 + crossed, gyroscope):
+                expected[own, one] += sign * 0.03**2
+    known, towards, begin = _known(None)
+    assert np.linalg.inv(known[22:46, 22:46]) == pytest.approx(expected, rel=1e-6, abs=1e-12)
+    assert (np.delete(np.diag(known), range(22, 46)).tolist(), towards.any()) == ([1e-6] * 28, begin.any())
+    draw = np.random.default_rng(SEED)
+    root, told = draw.normal(size=(22, 22)) + 9 * np.eye(22), draw.normal(size=22)
+    of = [0, 46, 47, 48, 1, 2, 3, 49, 50, 51, *range(22, 34)]
+    more, towards, begin = _known(Joint(told, root @ root.T))
+    more = more - known
+    more[22:34, 22:34] += np.linalg.inv(expected[:12, :12])
+    assert more[np.ix_(of, of)] == pytest.approx(np.linalg.inv(root @ root.T), rel=1e-4, abs=1e-3)
+    assert towards[of] == pytest.approx(np.linalg.inv(root @ root.T) @ told)
+    assert begin.tolist() == [
+        told[of.index(n)] if n in of else told[of.index(n + 36)] if 10 <= n < 16 else 0.0 for n in range(52)
+    ]

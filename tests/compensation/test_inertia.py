@@ -126,7 +126,9 @@ def test_samples_with_contact_are_left_out_and_what_no_body_has_is_refused() -> 
     felt = recorded("turned", 6, tool)
     pushed = (felt.times[:, None] % 5.0 < 1.5) * np.array([4.0, -2.0, 1.0])
     touched = felt._replace(force=felt.force + pushed, torque=felt.torque + np.cross([0.0, 0.1, 0.1], pushed))
-    assert identified(touched, tool, imu).payload.inertia == pytest.approx(tool.inertia, abs=5e-4)
+    found = identified(touched, tool, imu)
+    assert found.payload.inertia == pytest.approx(tool.inertia, abs=5e-4)
+    assert found.notes == ()
     with pytest.raises(CompensationError, match="touched the tool all the time"):
         identified(felt._replace(force=felt.force + np.array([4.0, 0.0, 0.0])), tool, imu)
     for factor, told in ((-1.0, "-1.0"), (np.degrees(1.0), "0.01"), (np.radians(1.0), "6")):
@@ -137,10 +139,6 @@ def test_samples_with_contact_are_left_out_and_what_no_body_has_is_refused() -> 
     spun = np.gradient(felt.rate, 1.0 / RATE_HZ, axis=0)
     with pytest.raises(CompensationError, match=r"which no body has|moves freely"):
         identified(felt._replace(torque=felt.torque + spun @ np.diag([0.1, 0.0, 0.0])), tool, imu)
-    lost = np.abs(felt.times % 3.0 - 1.0) > 0.2
-    assert identified(Felt(*(part[lost] for part in felt)), tool, imu).payload.inertia == pytest.approx(
-        tool.inertia, abs=5e-4
-    )
 
 
 # -- step by step, of exact data
@@ -206,6 +204,55 @@ def test_a_touch_is_left_out_with_what_is_near_and_hardly_any_turning_is_noise()
     assert pieces.tolist() == np.repeat(np.arange(20), 40).tolist()
     assert (minutes[0, 0, 0], minutes[-1, 0, 0]) == pytest.approx((-799 / 9600, 799 / 9600))
     assert kept == pytest.approx(np.broadcast_to(spun * [0, 0, 1, 1, 0, 0], (800, 3, 6)))
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        {}, {"fir": True}, {"sinc_length": 128}, {"acceleration_filter": 4}, {"acceleration_filter": 8},
+        {"angular_rate_filter": 5}, {"angular_rate_filter": 6, "fir": True}, {"sinc_length": 32},
+    ],
+)  # fmt: skip
+def test_all_that_is_made_of_samples_obeys_the_equations_of_motion(chosen: dict[str, Any]) -> None:
+    """Whatever the filters; also just beside gaps: all that an instant is made of is there."""
+    tool, given, draw = tool_of(4), settings(**chosen), np.random.default_rng(len(chosen))
+    tool = tool._replace(inertia=tuple(10.0 * each for each in tool.inertia))
+    aligned = align(given, 51200 / given["sinc_length"])
+    felt = motion.filtered(motion.turned(4), tool, 24.0, given, imu=motion.PERFECT)
+    gaps = [
+        (0.7, 0.72),
+        (2.0, 2.3),
+        (2.4, 2.5),
+        (2.9, 4.0),
+        (4.22, 4.3),
+        *((at, at + 0.05) for at in range(8, 20, 3)),
+    ]
+    kept = np.all([(felt.times < begin) | (felt.times > end) for begin, end in gaps], axis=0)
+    kept &= draw.random(len(kept)) > 0.001
+    felt = Felt(*(part[kept] for part in felt))
+    made = turn(felt.times, np.hstack(felt[1:]), aligned, EXACT, IMU)
+    moment = tool.mass * np.array(tool.center)
+    about = tensor(tool.inertia) + tool.mass * (
+        np.dot(tool.center, tool.center) * np.eye(3) - np.outer(tool.center, tool.center)
+    )
+    elements = about[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    force = made.force + tool.mass * made.felt + made.arm @ moment
+    torque = made.torque - np.cross(made.felt, moment) + made.spun @ elements
+    assert float(np.abs(force).max()) < 2e-4 * np.std(made.force)
+    assert float(np.abs(torque).max()) < 1e-3 * np.std(made.spun @ elements)
+    period, lag = aligned.period_s, aligned.lag_s or 0.0
+    taps = 22 if given["fir"] else 1
+    reach, expected = period * taps + abs(lag - period * (taps - 1) / 2) + 0.05, list[float]()
+    breaks = np.flatnonzero(np.diff(felt.times) > max(aligned.gap_s, 2.5 * period)) + 1
+    for own in np.split(felt.times, breaks):
+        if own[-1] - own[0] >= reach + 0.2:
+            at = np.arange(own[0], own[-1], period)[:: max(1, round(0.0125 / period))]
+            expected += at[(at > own[0] + reach) & (at < own[-1] - 0.05)].tolist()
+    assert made.times.tolist() == expected
+    width = max(3, round(0.05 / period) | 1) + 1  # of a Hann window, whose squares sum to 1.5 by that
+    assert made.noisier == pytest.approx(math.sqrt(width / 1.5))
+    with pytest.raises(CompensationError, match="there is a gap in every half second"):
+        turn(felt.times + np.floor(felt.times / 0.2), np.hstack(felt[1:]), aligned, EXACT, IMU)
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.sensor.response import imu_noise
-from bota_ft_compensation.alignment import align
+from bota_ft_compensation.alignment import Alignment, Array, align
 from bota_ft_compensation.bias import TareBasis, estimate_bias
 from bota_ft_compensation.bounds import Bounds
 from bota_ft_compensation.compensator import Compensator
@@ -162,14 +164,6 @@ def test_after_a_gap_noise_is_not_taken_for_spinning_up(sinc_length: int, seed: 
                 assert (left.size - usual.size[beside]).max() < 0.8
 
 
-def test_another_rate_and_another_sensor_begin_anew() -> None:
-    imu = ImuSpecificForce((0.1, 0.0, 0.0), alignment=align(settings(512, fir=True), 100.0))
-    for number in range(50):
-        imu.follow((5.0, 0.0, 9.8), ZERO, number / 100)
-    imu.align(align(settings(), RATE_HZ))
-    assert imu.follow((1.0, 0.0, 9.8), ZERO, 0.51) == pytest.approx((1.0, 0.0, 9.8))
-
-
 def test_of_a_ramp_it_gives_the_value_of_the_forces_instant() -> None:
     """Of acceleration and angular rate, and the slope of the rate, at every filter."""
     for sinc_length, fir in ((32, False), (64, False), (128, False), (256, False), (256, True), (64, True)):
@@ -204,25 +198,75 @@ def test_what_is_unknown_is_used_as_it_comes() -> None:
     assert (value.sum(), value @ np.arange(len(value)) / 400.0) == pytest.approx((1.0, 0.01))
 
 
-def test_a_mass_off_the_axis_is_spun_up() -> None:
-    """0.1 m off the axis, with 20 rad/s²: 4 N on 2 kg; after 4 ms."""
-    imu, spin = ImuSpecificForce((0.1, 0.0, 0.0), alignment=align({}, RATE_HZ)), 20.0
-    for number in range(80):
-        t = 0.1 + number / RATE_HZ
-        found = imu.follow((0.0, 0.0, STANDARD_GRAVITY), (0.0, 0.0, spin * t), t)
-        assert (found is None) == (number < 4)
-        assert found is None or found[1] == pytest.approx(spin * 0.1, rel=1e-3)
-    assert found is not None
-    assert found[0] == pytest.approx(-((spin * t) ** 2) * 0.1, rel=1e-3)
+class Slowly:
+    """`ImuSpecificForce` as a list of samples that is looked through for each."""
+
+    def __init__(self, lever: Vector3, known: Accelerometer, gyroscope: Array, alignment: Alignment) -> None:
+        self.lever, self.known, self.gyroscope, self.alignment = np.array(lever), known, gyroscope, alignment
+        self.rows, self.since, self.moved, self.last_s = np.zeros((0, 6)), 0, False, -math.inf
+
+    def follow(self, row: Array, time_s: float) -> Array | None:
+        size, lead = self.alignment.taps.shape[1], self.alignment.lead
+        if not np.isfinite(row).all():
+            self.last_s = -math.inf
+            return None
+        periods = round((time_s - self.last_s) / self.alignment.period_s) if self.last_s > -math.inf else 0
+        if 0.0 < time_s - self.last_s <= self.alignment.gap_s:
+            missing = np.linspace(self.rows[-1], row, max(periods, 1) + 1)[1:]
+            before, self.since = self.since, self.since + len(missing)
+            self.rows = np.vstack([self.rows, missing])
+            if before < lead <= self.since:  # what was before is on the line through them
+                known, ago = self.rows[-min(self.since, size) :], np.arange(size)[:, np.newaxis]
+                slope, first = np.polyfit(np.arange(len(known)), known, 1)
+                self.rows = np.vstack([first - (ago[::-1] + 1) * slope, known])
+        else:
+            if self.since:
+                fastest = np.linalg.norm(self.rows[-size:, 3:], axis=1).max()
+                pushed = np.linalg.norm(self.rows[-1, :3] - row[:3])
+                self.moved = bool(fastest > 0.05 or pushed > 0.5)
+            self.rows, self.since = np.tile(row, (size, 1)), 1
+        self.last_s = time_s
+        if self.since < lead and self.lever.any() and (self.moved or np.linalg.norm(row[3:]) > 0.05):
+            return None
+        (felt, *_), (_, rate), (_, spin) = (
+            np.split(each, 2) for each in self.alignment.taps @ self.rows[-size:]
+        )
+        rate, spin = self.gyroscope @ rate, self.gyroscope @ spin
+        arm = np.cross(spin, self.lever) + np.cross(rate, np.cross(rate, self.lever))
+        return np.concatenate([self.known.correct(tuple(felt)) + arm, rate, spin])
 
 
-@pytest.mark.parametrize("broken", [math.nan, math.inf])
-def test_numbers_that_are_none_give_no_answer_and_do_no_lasting_harm(broken: float) -> None:
-    imu = ImuSpecificForce((0.0, 0.0, 0.1))
-    for number, rate in enumerate((0.0, broken, 0.0, 0.0)):
-        found = imu.follow((0.0, 0.0, 9.8), (rate, 0.0, 0.0), number / RATE_HZ)
-        assert (found is None) == (not math.isfinite(rate))
-    assert found == pytest.approx((0.0, 0.0, 9.8))
+@pytest.mark.parametrize("seed", range(16))
+def test_the_specific_force_is_that_of_the_aligned_samples_also_around_gaps(seed: int) -> None:
+    """Of a tool at rest, pushed, turned slowly or fast, with samples that are lost, late or no numbers."""
+    draw, chosen = np.random.default_rng(seed), settings((64, 32, 128)[seed % 3], fir=bool(seed % 2))
+    aligned = align(chosen, 51200 / chosen["sinc_length"])
+    lever: Vector3 = (ZERO, (0.03, -0.02, 0.1), (0.0, 0.0, -0.2), (0.0, 0.1, 0.0), (0.2, 0.0, 0.0))[seed % 5]
+    gyroscope = np.eye(3) + 0.1 * draw.normal(size=(3, 3))
+    known = imperfect(seed).known
+    found = ImuSpecificForce(lever, known, None, tuple(gyroscope.ravel().tolist()))
+    found.align(aligned)
+    expected, time_s, row, withheld = Slowly(lever, known, gyroscope, aligned), 10.0, np.zeros(6), 0
+    for number in range(600):
+        if number % 40 == 0:  # at rest, or not
+            row = draw.normal(size=6) * ([3.0] * 3 + [draw.choice((0.0, 0.03, 1.0))] * 3)
+        if number == 400:
+            aligned = align(settings(64), RATE_HZ)
+            found.align(aligned)
+            expected = Slowly(lever, known, gyroscope, aligned)
+        chance = draw.random()
+        lost = draw.integers(1, 4) if chance < 0.03 else draw.integers(20, 60) if chance < 0.06 else 0
+        time_s += (1 + lost + draw.uniform(-0.2, 0.2)) * aligned.period_s - 3600.0 * (chance > 0.995)
+        sent = row + ([0.15] * 3 + [0.0] * 3) * draw.normal(size=6)
+        if chance > 0.99:
+            sent[draw.integers(6)] = draw.choice((math.nan, math.inf))
+        given: Any = sent.tolist()
+        got, wanted = found.follow(tuple(given[:3]), tuple(given[3:]), time_s), expected.follow(sent, time_s)
+        assert (got is None) == (wanted is None), number
+        if got is not None and wanted is not None:
+            assert [*got, *found.turning[0], *found.turning[1]] == pytest.approx(wanted, abs=1e-8)
+        withheld += got is None and bool(np.isfinite(sent).all())
+    assert (withheld > 5) is any(lever)
 
 
 # -- tare and bound
@@ -267,7 +311,6 @@ def test_a_tare_in_any_pose_is_right_in_all_poses_and_with_every_tool(seed: int)
     assert again.plus(change).values == pytest.approx(tared.values)
 
 
-ALIGNED = align({}, RATE_HZ)
 NO_ERRORS = EXACT._replace(
     offset_interval=(0.0,) * 3, scale_interval=(0.0,) * 3, cross_axis_interval=(0.0,) * 6
 )
@@ -311,80 +354,71 @@ def test_the_bound_covers_the_accelerometers_errors_in_95_percent(
     assert 0.93 <= held / draws <= 0.97
 
 
-# Orientations.
+# -- orientations
 
 
-def quaternion_about(axis: Vector3, turned: float) -> tuple[float, float, float, float]:
-    x, y, z = (math.sin(turned / 2) * part for part in axis)
-    return x, y, z, math.cos(turned / 2)
+def rotated(vector: Array, by: Array) -> Array:
+    """By a rotation vector, rad; Rodrigues."""
+    angle = float(np.linalg.norm(by))
+    axis = by / (angle or 1.0)
+    along = axis * (axis @ vector) * (1 - math.cos(angle))
+    return np.asarray(vector * math.cos(angle) + np.cross(axis, vector) * math.sin(angle) + along)
 
 
-def test_which_orientation_counts_and_for_how_long() -> None:
-    source = QuaternionGravity(stale_after_s=0.1)
-    source.update((0.0, 0.0, 0.0, 1.0), 1.0)
-    assert not source.update((1.0, 0.0, 0.0, 0.0), 0.95)
-    assert source.gravity(1.0) == pytest.approx(DEFAULT_GRAVITY)
-    assert source.update((1.0, 0.0, 0.0, 0.0), 0.5), "unless the clock was set back"
-    source.update(quaternion_about((1.0, 0.0, 0.0), math.pi / 2), 2.0)
-    assert source.gravity(2.0) == pytest.approx((0.0, -STANDARD_GRAVITY, 0.0)), "its y axis points up"
-    source = QuaternionGravity(stale_after_s=0.25)
-    source.update((0.0, 0.0, 0.0, 1.0), 10.0)
-    answers = [source.gravity(now) is not None for now in (10.0, 10.25, 10.26, 1000.0, 9.7)]
-    assert answers == [True, True, False, False, False]
-    assert source.age_s(10.2) == pytest.approx(0.2)
-
-
-# Orientations that are older or newer than the sample.
-
-
-AXIS = (0.6, -0.48, 0.64)
-
-
-def arm(turned: float) -> tuple[float, float, float, float]:
-    """The orientation of a sensor that has turned about an axis between its own by so much."""
-    return quaternion_about(AXIS, turned)
-
-
-def spun(rate: float) -> Vector3:
-    x, y, z = (rate * part for part in AXIS)
-    return x, y, z
-
-
-@pytest.mark.parametrize("told_s", [1.0, 1.003, 1.0199, 1.024])
-@pytest.mark.parametrize("late", [False, True])
-def test_an_orientation_between_two_samples_is_turned_on_by_what_is_left(told_s: float, late: bool) -> None:
-    source = QuaternionGravity()
-
-    def at(time_s: float) -> tuple[float, float, float, float]:
-        """Faster and faster, from 2 rad/s on."""
-        return arm(2.0 * time_s + 0.05 * (time_s - 1.0) ** 2)
-
-    for number in range(4):
-        if number == 2 + late:
-            source.update(at(told_s), told_s)
-        if number < 3 or told_s < 1.02:
-            source.add_rate(spun(2.0 + 0.001 * number), 1.0 + 0.01 * number)
-    expected = QuaternionGravity()
-    expected.update(at(1.03 if told_s < 1.02 else 1.02), told_s)
-    assert source.gravity(told_s) == pytest.approx(expected.gravity(told_s), abs=1e-4)
-
-
-def test_an_orientation_is_turned_on_from_the_first_two_rates_on() -> None:
-    source = QuaternionGravity()
-    assert source.update((0.0, 0.0, 0.0, 1.0), 0.0)
-    source.add_rate(spun(2.0), 0.0)
-    source.add_rate(spun(2.0), 0.01)
-    expected = QuaternionGravity()
-    expected.update(arm(0.02), 0.0)
-    assert source.gravity(0.01) == pytest.approx(expected.gravity(0.0), abs=1e-4)
-
-
-def test_an_orientation_is_held_where_the_gyroscope_is_of_no_use() -> None:
-    source = QuaternionGravity()
-    source.add_rate((2.0, 0.0, 0.0), 1.0)
-    source.update(arm(0.0), 1.0)
-    source.add_rate((math.nan, 0.0, 0.0), 1.01)
-    assert source.gravity(1.05) == pytest.approx(DEFAULT_GRAVITY)
-    for time_s in (1.02, 9.0, 1.0):  # a gap; and a clock that was set back
-        source.add_rate((2.0, 0.0, 0.0), time_s)
-    assert source.gravity(1.05) == pytest.approx(DEFAULT_GRAVITY)
+@pytest.mark.parametrize("seed", range(12))
+def test_gravity_is_that_of_the_newest_orientation_turned_on_by_the_rates_since(seed: int) -> None:
+    """Between two samples, late, ahead of them or stale; over gaps, set clocks and bad rates it is held."""
+    draw, source, stale_s = np.random.default_rng(seed), QuaternionGravity(stale_after_s=0.125), 0.125
+    time_s, newest_s, rate = 100.0, -math.inf, 0.5 * draw.normal(size=3)
+    known: list[tuple[float, Array]] = []  # rates since they began anew
+    told: tuple[float, Array] | None = None  # the orientation, as gravity; and what has turned it since
+    turns: list[Array] = []
+    for _ in range(400):
+        chance = draw.random()
+        steps = draw.choice((128, 129, -20, -(2**20))) if chance < 0.06 else draw.integers(8, 13)
+        time_s += int(steps) / 1024
+        rate = 0.95 * rate + 0.15 * draw.normal(size=3)
+        sent = rate * (math.nan if 0.06 < chance < 0.08 else 1.0)
+        source.add_rate(triple(sent), time_s)
+        if known and not 0.0 <= time_s - known[-1][0] <= stale_s:
+            known = []
+        known = [*known, (time_s, sent)] if np.isfinite(sent).all() else []
+        if told is not None and len(known) > 1:
+            (before_s, before), (after_s, after) = known[-2:]
+            if told[0] > after_s:
+                before_s, before = told[0], after
+            turns.append(-(after_s - max(before_s, told[0])) * (before + after) / 2)
+            told = after_s, told[1]
+        if draw.random() < 0.3:
+            at_s = time_s + int(draw.choice((-51, -13, 0, 4))) / 1024
+            x, y, z, w = draw.normal(size=4).tolist()
+            size = math.sqrt(x * x + y * y + z * z + w * w)
+            is_old = 0.0 < newest_s - at_s <= stale_s
+            assert source.update((x / size, y / size, z / size, w / size), at_s) is not is_old
+            if not is_old:
+                axis, turned = (
+                    np.array([x, y, z]) / math.hypot(x, y, z),
+                    2 * math.atan2(math.hypot(x, y, z), w),
+                )
+                newest_s, turns = at_s, []
+                told = at_s, rotated(np.array(DEFAULT_GRAVITY), -turned * axis)
+                since = [each for each in known if each[0] <= at_s][-1:]
+                if since and since[0] is known[-1]:
+                    turns.append((at_s - since[0][0]) * since[0][1])
+                since += [each for each in known if each[0] > at_s]
+                for (before_s, before), (after_s, after) in pairwise(since):
+                    turns.append(-(after_s - max(before_s, at_s)) * (before + after) / 2)
+                told = since[-1][0] if since else at_s, told[1]
+        elif draw.random() < 0.02:
+            source.reset()
+            newest_s, told, turns, known = -math.inf, None, [], []
+        now_s = time_s + int(draw.choice((0, 5, 51, 128, 129))) / 1024
+        assert source.age_s(now_s) == abs(now_s - newest_s)
+        found = source.gravity(now_s)
+        if told is None or abs(now_s - newest_s) > stale_s:
+            assert found is None
+            continue
+        expected = told[1]
+        for each in turns:
+            expected = rotated(expected, each)
+        assert found == pytest.approx(tuple(expected.tolist()), abs=2e-3)

@@ -143,8 +143,8 @@ class _Model:
             row, column = divmod(number, 3)
             less = np.zeros((3, 3))
             less[row, column] = -1.0
-            of_products = less @ products
-            change, spun_change = _turning(spin @ less.T, of_products + of_products.transpose(0, 2, 1))
+            of_products = less @ self._products @ right.T
+            change, spun_change = _turning(self._spin @ less.T, of_products + of_products.transpose(0, 2, 1))
             moved = -change @ place
             by_gyroscope[:, :3, number] = -mass * moved - change @ moment
             by_gyroscope[:, 3:, number] = np.cross(moved, moment) - spun_change @ tensor
