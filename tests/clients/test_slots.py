@@ -47,13 +47,14 @@ class Part(NamedTuple):
     @property
     def in_force(self) -> InForce:
         settings = SETTINGS | {"sinc_length": 64, "fir": self.fir, "imu_active": int(self.imu)}
+        settings["acceleration_filter"] = 4 if self.fir else 1
         return InForce(SensorInfo(settings=settings, rate_hz=self.rate_hz), epoch=self.epoch)
 
     @property
     def delays_ns(self) -> list[int]:
         """Of force and torque 1.5 samples, with FIR 12, to 0.01 ms; and of the IMU's two filters."""
         of_force = {800.0: (1_880_000, 15_000_000), 400.0: (3_750_000, 30_000_000)}[self.rate_hz][self.fir]
-        return [of_force, 1_940_000, 2_900_000]
+        return [of_force, 11_800_000 if self.fir else 1_940_000, 2_900_000]
 
 
 class Slot(NamedTuple):
@@ -116,7 +117,6 @@ def slots_of(parts: Sequence[Part]) -> tuple[list[Slot], list[DataMessage]]:
 
 
 def valid_of(sample: DataMessage, part: Part) -> tuple[list[bool], list[float]]:
-    """By channel, and its twelve numbers."""
     found = SampleDecoder(61).decode(sample.process_data)
     valid = [channel.judge(found) is Usability.USABLE for channel in CHANNELS[:3]]
     return [valid[0], valid[1] and part.imu, valid[2] and part.imu], [
@@ -141,6 +141,9 @@ def test_a_window_has_the_slots_that_were_measured_before_its_instant(seed: int)
     made.configure(parts[0].in_force)
     for name, array in made.at(np.array([5]), is_partial=True).items():
         assert not array.any() if name.endswith("valid") else np.isnan(array).all(), name
+    with pytest.raises(RecordingError, match="restarted meanwhile: record again"):
+        made.add(columns([frame(n, flags=GAP)._replace(monotonic_ns=ns) for n, ns in enumerate((9, 8, 10))]))
+    made = Windows(LENGTH, tool=NO_TOOL if seed % 2 else None)
     come = 0
     for number, part in enumerate(parts):
         made.configure(part.in_force)
@@ -206,7 +209,7 @@ def test_rows_are_the_slots_with_the_stamps_of_the_wall_clock_between(tmp_path: 
             off += draw.choice((0, 0, 7, limit, -limit, limit + 1, -limit - 1, -3_600_000_000_000))
         before = before if each.flags & (REPEATED | INVALID) else each.monotonic_ns
         frames.append(each._replace(stamp_ns=each.monotonic_ns + off))
-    row = describe(0, **SETTINGS | {"fir": part.fir, "imu_active": int(part.imu)})
+    row = describe(0, **part.in_force.info.settings)
     row["sensors"][0]["rate_hz"] = part.rate_hz
     items: list[Any] = [row]
     for each in frames:

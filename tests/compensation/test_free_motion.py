@@ -268,7 +268,6 @@ def test_the_noise_of_samples_is_what_is_left_less_what_the_imu_makes() -> None:
 
 
 def test_of_the_imu_is_known_before_what_is_typical_and_what_poses_say() -> None:
-    """The whole chip may be turned, by 0.03 rad about each axis: accelerometer and gyroscope alike."""
     expected = np.diag([0.4**2] * 3 + [0.005**2] * 9 + [0.006**2] * 9 + [1.3e-3**2] * 3)
     for row, column in itertools.product(range(3), repeat=2):
         gyroscope = 12 + 3 * row + column

@@ -583,7 +583,7 @@ def test_what_else_is_in_a_mailbox_is_left_alone_and_emergencies_are_noted() -> 
     known = Emergencies(bus.clock)
     sdo = MailboxSdo(cast(Bus, bus), 7, MAILBOXES, known)
     assert finish(sdo.read(PROBED, 0), bus.clock) == b"efgh"
-    assert known.status(7)["emergencies"] == 1
+    assert (known.status(7)["emergencies"], known.status(7)["emergency"]["data"]) == (1, b"abcde".hex())
     bus.messages = [(3, 1, emergency)] * 3
     finish(sdo.poll_mailbox(), bus.clock)
     assert (known.status(7)["emergencies"], len(bus.messages)) == (2, 2)
