@@ -242,6 +242,10 @@ def moving(rate_hz: float) -> Iterator[tuple[float, tuple[float, ...]]]:
         time_s += random_.choice((*(1,) * 12, 0, 2, 3, 5, 15, 90, 90)) / rate_hz * random_.uniform(0.9, 1.1)
         last = math.nan if number % 60 == 50 else rates[2]
         yield time_s, (*(each + random_.gauss(0, 0.1) for each in felt), *rates[:2], last)
+    for number in range(60):  # in gaps, about as much as is a push, and turned about as much as is turning
+        time_s += 90 / rate_hz
+        part, other = 1.0 + 0.001 * (number - 30), number % 2
+        yield time_s, (0.5 * part * other, 0.0, 9.8, 0.05 * part * (number % 3 == 1), 0.0, 0.0)
 
 
 def loads(running: Loop, model: str, lag_s: float, fir: bool, rate_hz: float, *samples: Any) -> Any:

@@ -273,7 +273,8 @@ public:
     Wrench follow(const bota_ethercat::Sample& sample, double time_s) {
         if (!sample.imu_is_finite()) time_s_ = kNever;
         if (!sample.imu_is_finite() || sample.acceleration == Vector3{}) return none();
-        append(row(sample), time_s - time_s_);
+        const Vector3 &a = sample.acceleration, &w = sample.angular_rate;
+        append({a[0], a[1], a[2], w[0], w[1], w[2]}, time_s - time_s_);
         time_s_ = time_s;
         if (known_ < alignment_.lead && (moved_ || turns(ring_[at_])) && lever_ != Vector3{}) return none();
         const auto [s, omega, alpha] = aligned();
@@ -290,7 +291,7 @@ public:
     Bounds bounds(bool tared, const std::optional<Vector3>& at = {}) const { return {payload_, lever_, alignment_, tared, at}; }
 
 private:
-    using Row = std::array<double, 6>;  // true acceleration, angular rate
+    using Row = std::array<double, 6>;  // acceleration and angular rate as read: corrected once aligned, which is linear
     static constexpr double kNever = -1e18;  // s; infinity is nothing that -ffast-math knows
 
     static bool turns(const Row& row) noexcept {
@@ -312,14 +313,16 @@ private:
         return {xx * v[0] + xy * v[1] + xz * v[2], xy * v[0] + yy * v[1] + yz * v[2], xz * v[0] + yz * v[1] + zz * v[2]};
     }
 
-    Row row(const bota_ethercat::Sample& sample) const noexcept {
-        Vector3 a = sample.acceleration;
+    Vector3 corrected(Vector3 a) const noexcept {
         for (std::size_t i = 0; i < 3; ++i) a[i] = (a[i] - payload_.accelerometer_offset[i]) / payload_.accelerometer_scale[i];
         const auto& [xy, xz, yx, yz, zx, zy] = payload_.accelerometer_cross_axis;
-        const Vector3& w = sample.angular_rate;
+        return {a[0] - xy * a[1] - xz * a[2], a[1] - yx * a[0] - yz * a[2], a[2] - zx * a[0] - zy * a[1]};
+    }
+
+    Vector3 turning(const Vector3& w) const noexcept {
         const auto& g = payload_.gyroscope;
-        const auto turned = [&](std::size_t i) { return g[i] * w[0] + g[i + 1] * w[1] + g[i + 2] * w[2]; };
-        return {a[0] - xy * a[1] - xz * a[2], a[1] - yx * a[0] - yz * a[2], a[2] - zx * a[0] - zy * a[1], turned(0), turned(3), turned(6)};
+        const auto about = [&](std::size_t i) { return g[i] * w[0] + g[i + 1] * w[1] + g[i + 2] * w[2]; };
+        return {about(0), about(3), about(6)};
     }
 
     /// Append a sample that comes `passed_s` after the one before, and interpolate those that are missing between them.
@@ -374,7 +377,7 @@ private:
             for (std::size_t i = 0; i < 3; ++i) s[i] += value[k] * row[k][i];
         for (std::size_t k = 0; k < rate.size(); ++k)
             for (std::size_t i = 0; i < 3; ++i) omega[i] += rate[k] * row[k][3 + i], alpha[i] += slope[k] * row[k][3 + i];
-        return {s, omega, alpha};
+        return {corrected(s), turning(omega), turning(alpha)};
     }
 
     Payload payload_;
