@@ -8,11 +8,13 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
+import numpy as np
+
 from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.stream.timeline import InForce
-from bota_ft_compensation.alignment import align
+from bota_ft_compensation.alignment import Array, align
 from bota_ft_compensation.quantities import (
     EXACT,
     IDENTITY,
@@ -109,6 +111,16 @@ class ImuSource(Source):
             return None
         self.felt = found
         return found
+
+    def follow_all(self, acceleration: Array, angular_rate: Array, times: Array) -> tuple[Array, Array]:
+        """As `follow`, of samples (n, 3) at `times` (n,): (3, n), NaN for None, and `turning` (2, 3, n)."""
+        felt, turned = self._imu.follow_all(np.hstack([acceleration, angular_rate]), times)
+        self.turning = self._imu.turning
+        felt[:, ~acceleration.any(axis=1)] = math.nan
+        for at in np.flatnonzero(np.isfinite(felt[0]))[-1:]:
+            x, y, z = felt[:, at].tolist()
+            self.felt = x, y, z
+        return felt, turned
 
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         if not any(sample.acceleration):
