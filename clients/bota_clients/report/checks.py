@@ -66,8 +66,8 @@ class _Windows:
         self._series, self._limit = series, _limits(series)
         self._length = max(_WINDOW_S, _FEWEST_SAMPLES * series.period)
         self._fewest = max(_FEWEST_SAMPLES // 2, int(_FILLED * self._length / series.period))
-        # Of the window that goes on: time, values, usable.
-        self._rest = np.zeros(0), np.zeros((0, len(CHANNELS))), np.zeros((0, len(CHANNELS)), bool)
+        # Time, values and usable of the window that goes on.
+        self._rest: Sequence[Any] = np.zeros(0), np.zeros((0, 12)), np.zeros((0, 12), bool)
         self._count = 0
         self._every = 1  # one of so many windows is remembered
         self._kept = list[Floats]()  # (2, 12): deviation, range
@@ -77,9 +77,7 @@ class _Windows:
         """None: the end."""
         rows = self._rest
         if samples is not None:
-            rows = (
-                *map(np.concatenate, zip(rows, (samples.time, samples.values, samples.usable), strict=True)),
-            )
+            rows = [np.concatenate(each) for each in zip(rows, samples[:3], strict=True)]
         number = np.floor(rows[0] / self._length)
         # A clock that jumps back must not join samples that are far apart.
         edges = [0, *(np.flatnonzero(np.diff(number) != 0) + 1).tolist()]
@@ -88,7 +86,7 @@ class _Windows:
         for begin, end in itertools.pairwise(edges):
             if end - begin >= self._fewest:
                 self._measure(*(each[begin:end] for each in rows))
-        self._rest = (*(each[edges[-1] :] for each in rows),)
+        self._rest = [each[edges[-1] :] for each in rows]
 
     def _measure(self, time: Floats, values: Floats, usable: Bools) -> None:
         deviation, reach, rough = _window(time, values, usable)

@@ -77,8 +77,8 @@ class _Plot:
     def segments(self, times: Any, heights: Any, color: str, width: float, more: str = "") -> None:
         """Lines (n, 2) from and to these times and heights, 0 to 1 in the panel."""
         times, heights = np.broadcast_arrays(np.atleast_2d(times), np.atleast_2d(heights))
-        ended = np.full((len(times), 1), np.nan)
-        self._path(*(np.hstack([each, ended]).ravel() for each in (times, heights)), color, width, more)
+        x, y = (np.insert(each, 2, np.nan, axis=1).ravel() for each in (times, heights))
+        self._path(x, y, color, width, more)
 
     def _path(self, times: Floats, heights: Floats, color: str, width: float, more: str = "") -> None:
         known = np.isfinite(heights)
