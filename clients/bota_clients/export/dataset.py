@@ -21,6 +21,8 @@ import math
 import os
 import shutil
 import tempfile
+import zipfile
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
@@ -31,7 +33,7 @@ import numpy as np
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import DATASETS, PROGRAM
 from bota_clients.export.samples import MOST_LOST, samples_of
-from bota_clients.export.windows import Array, Arrays, Windows, interpolated, read_tool
+from bota_clients.export.windows import Arrays, Windows, interpolated, read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.columns import REGISTERS, Ints
@@ -180,20 +182,27 @@ class Stamped:
         """What is not later than the row before, unless the clock was set back, or it is much."""
         kept = in_order(self._stamps)
         if self._clock is None and not kept.all():
-            batches = TimeAxis().batches(recording.batches(sensor))
-            new = [np.stack([each.stamp_ns, each.monotonic_ns])[:, each.fresh] for _, each in batches]
-            kept = longest_order(self._places(*np.hstack([np.zeros((2, 0), np.int64), *new])))
+            clocks, steps = np.zeros((2, 0), np.int64), list[Ints]()
+            for _, each in TimeAxis().batches(recording.batches(sensor)):
+                new = np.stack([each.stamp_ns, each.monotonic_ns])[:, each.fresh]
+                clocks = np.hstack([clocks[:, -1:], new])
+                last = np.flatnonzero(np.diff(clocks[0]) < 0)  # before each step back
+                steps.append(np.stack([clocks[:, last], clocks[:, last + 1]]))
+            before, after = np.concatenate([np.zeros((2, 2, 0), np.int64), *steps], axis=2)
+            kept = longest_order(self._places(before, after))
         if (~kept).mean() <= MOST_LEFT_OUT:
             self.left_out = int((~kept).sum())
             self._rows, self._stamps, self._left = self._rows[kept], self._stamps[kept], self._left[kept]
             self.count -= self.left_out
 
-    def _places(self, stamps: Ints, instants: Ints) -> Iterator[list[int]]:
-        """Of each row the stretches without a step back that it may be of, by the samples' clocks; and it."""
-        last = np.flatnonzero(np.diff(stamps) < 0)  # before each step back
-        apart = instants[last + 1] - instants[last]
-        first = [-math.inf, *(stamps[last + 1] - apart).tolist()]
-        ends = [*(stamps[last] + apart).tolist(), math.inf]
+    def _places(self, before: Ints, after: Ints) -> Iterator[list[int]]:
+        """Of each row the stretches without a step back that it may be of, and it.
+
+        By the samples' clocks (2, k), stamps and instants, before and after each of the k steps.
+        """
+        apart = after[1] - before[1]
+        first = [-math.inf, *(after[0] - apart).tolist()]
+        ends = [*(before[0] + apart).tolist(), math.inf]
         for row in self._stamps.tolist():
             within = enumerate(zip(first, ends, strict=True))
             yield [(number << 64) + row for number, (begin, end) in within if begin <= row <= end]
@@ -459,20 +468,19 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     with tempfile.TemporaryDirectory(
         prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
     ) as folder:
-        made, valid = Path(folder, path.name), list[Array]()
+        made, tally = Path(folder, path.name), Counter[bool]()
         if frames:
             blocks = in_chunks(windows_of(recording, frames, windows, sensor.sensor, axis), _CHUNK)
         else:
             blocks = in_chunks(samples_of(recording, windows, sensor.sensor, axis), _GROUP)
-            blocks = _tallied(blocks, valid)
+            blocks = _tallied(blocks, tally)
         _WRITERS[options.suffix](made, said, blocks)
         if path.is_dir():
             shutil.rmtree(path)
         made.replace(path)
     remarks = axis.said
     if not frames:
-        rows = np.concatenate(valid)
-        remarks.insert(0, f"{count(len(rows), 'sample')}, {len(rows) - rows.sum()} of them not valid")
+        remarks.insert(0, f"{count(tally.total(), 'sample')}, {tally[False]} of them not valid")
         return "; ".join(remarks)
     if isinstance(frames, Stamped) and frames.outside:
         remarks.append(
@@ -513,10 +521,11 @@ def about(
     }  # fmt: skip
 
 
-def _tallied(blocks: Iterable[Arrays], valid: list[Array]) -> Iterator[Arrays]:
-    """The same, and which of the rows are valid."""
+def _tallied(blocks: Iterable[Arrays], tally: Counter[bool]) -> Iterator[Arrays]:
+    """The same; counted is which of the rows are valid."""
     for block in blocks:
-        valid.append(block["valid"])
+        valid = int(block["valid"].sum())
+        tally.update({True: valid, False: len(block["valid"]) - valid})
         yield block
 
 
@@ -596,9 +605,29 @@ def parquet_writer(path: Path, schema: Any, more: Mapping[str, str] = {}) -> Any
 
 
 def _npz(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
-    """An array for each name, and `attributes`, text."""
-    arrays: dict[str, Any] = _as_one(list(blocks))
-    np.savez(path, attributes=np.array(about), **arrays)
+    """An array for each name, and `attributes`, text; in memory is a block."""
+    parts, rows, shapes = dict[str, Any](), 0, dict[str, Any]()
+    with contextlib.ExitStack() as stack, zipfile.ZipFile(path, "w") as made:
+        for block in blocks:
+            rows += len(block["monotonic_ns"])
+            for name, array in block.items():
+                if name not in parts:
+                    parts[name] = stack.enter_context(tempfile.TemporaryFile(dir=path.parent))
+                    shapes[name] = array.dtype, array.shape[1:]
+                parts[name].write(array.tobytes())
+        with made.open("attributes.npy", "w") as member:
+            np.lib.format.write_array(member, np.array(about))
+        for name, part in parts.items():
+            kind, shape = shapes[name]
+            head = {
+                "descr": np.lib.format.dtype_to_descr(kind),
+                "fortran_order": False,
+                "shape": (rows, *shape),
+            }
+            with made.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array_header_1_0(member, head)
+                part.seek(0)
+                shutil.copyfileobj(part, member)
 
 
 def _zarr(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
