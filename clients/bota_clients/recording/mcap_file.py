@@ -20,7 +20,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, Final, Self, TypeVar
+from typing import Final, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -118,7 +118,7 @@ class McapFile:
         self._known: dict[_Counts, _Counts] = {}
         self._zstd = zstandard.ZstdDecompressor()
         try:
-            self._file: BinaryIO = path.open("rb")
+            self._file = path.open("rb", buffering=0)
             try:
                 self._size = os.fstat(self._file.fileno()).st_size
                 self._open()
