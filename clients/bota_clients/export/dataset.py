@@ -22,7 +22,7 @@ import os
 import shutil
 import tempfile
 import zipfile
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
@@ -60,9 +60,7 @@ _FIRST: Final = -(1 << 63)
 _COARSEST_S: Final = 0.001
 _DAY_NS: Final = 10**14  # after 1970: earlier times count from the start of something
 _NEAR_NS: Final = 366 * 86400 * _SECOND
-MOST_LEFT_OUT: Final = (
-    0.1  # of rows or messages, because of their order: with more it is the stamps that are wrong
-)
+MOST_LEFT_OUT: Final = 0.1  # of rows or messages, for their order: with more it is the stamps that are wrong
 
 
 class ForeignClock(NamedTuple):
@@ -131,11 +129,8 @@ class Stamped:
         """
         self.outside, self.left_out, self.strict, self._early = 0, 0, strict, 0
         self.count, self._stamps, self._source, self._clock = len(stamps_ns), stamps_ns, source, clock
-        self._rows, self._left, self._latency_ns = (
-            np.arange(len(stamps_ns)),
-            stamps_ns,
-            round(latency_s * _SECOND),
-        )
+        self._rows, self._left = np.arange(len(stamps_ns)), stamps_ns
+        self._latency_ns = round(latency_s * _SECOND)
 
     def exposed(self, stamps: Ints, instants: Ints) -> Ints:
         """(2, f) ns: stamps of the frames up to the last of these samples, and instants of their exposure.
@@ -606,28 +601,22 @@ def parquet_writer(path: Path, schema: Any, more: Mapping[str, str] = {}) -> Any
 
 def _npz(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
     """An array for each name, and `attributes`, text; in memory is a block."""
-    parts, rows, shapes = dict[str, Any](), 0, dict[str, Any]()
+    rows, block = 0, Arrays()
     with contextlib.ExitStack() as stack, zipfile.ZipFile(path, "w") as made:
+        parts = defaultdict[str, Any](lambda: stack.enter_context(tempfile.TemporaryFile(dir=path.parent)))
         for block in blocks:
             rows += len(block["monotonic_ns"])
             for name, array in block.items():
-                if name not in parts:
-                    parts[name] = stack.enter_context(tempfile.TemporaryFile(dir=path.parent))
-                    shapes[name] = array.dtype, array.shape[1:]
                 parts[name].write(array.tobytes())
         with made.open("attributes.npy", "w") as member:
             np.lib.format.write_array(member, np.array(about))
-        for name, part in parts.items():
-            kind, shape = shapes[name]
-            head = {
-                "descr": np.lib.format.dtype_to_descr(kind),
-                "fortran_order": False,
-                "shape": (rows, *shape),
-            }
+        for name, array in block.items():
+            head = np.lib.format.header_data_from_array_1_0(array)
+            head |= {"fortran_order": False, "shape": (rows, *array.shape[1:])}
             with made.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array_header_1_0(member, head)
-                part.seek(0)
-                shutil.copyfileobj(part, member)
+                parts[name].seek(0)
+                shutil.copyfileobj(parts[name], member)
 
 
 def _zarr(path: Path, about: str, blocks: Iterable[Arrays]) -> None:

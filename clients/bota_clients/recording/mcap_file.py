@@ -137,22 +137,10 @@ class McapFile:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def messages(self, channels: Collection[int]) -> Iterator[tuple[int, int, memoryview]]:
-        """Channel, log time (ns) and body of the messages of these channels in file order.
-
-        RecordingError at the first corrupt chunk.
-        """
-        wanted = frozenset(channels)
-        for rows in self.rows(wanted):
-            for row in rows:
-                found = message_in(row)
-                if found[0] in wanted:
-                    yield found
-
     def rows(self, channels: Collection[int]) -> Iterator[Rows]:
         """The records of messages, with their heads, in file order, of chunks that have these channels.
 
-        Shorter ones are padded with zeros. RecordingError as `messages`.
+        Shorter ones are padded with zeros. RecordingError at the first corrupt chunk.
         """
         with progress(self.path.name, len(self._chunks)) as reach:
             for number, (chunk, counts) in enumerate(zip(self._chunks, self._counts, strict=True)):

@@ -30,10 +30,7 @@ def in_order(stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
 def longest_order(places: Iterable[Iterable[int]]) -> npt.NDArray[np.bool_]:
     """The same of rows that may be at any of their places."""
     lasts, ends = list[int](), list[int]()  # of the best sequence of each length: last place, and its number
-    numbers, count = (
-        list[tuple[int, int]](),
-        0,
-    )  # of each place: its row, and what is before it in its sequence
+    numbers, count = list[tuple[int, int]](), 0  # of each place: its row, and what is before it
     for row, each in enumerate(places):
         count = row + 1
         for place in sorted(each, reverse=True):

@@ -14,7 +14,7 @@ import itertools
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -126,12 +126,12 @@ class Recording(McapFile):
         self.frame_count = counts.total()
         self.events: list[RecordedEvent] = []
         timeline, changes = Timeline(), defaultdict[int, list[Since]](list)
-        for taken, note in enumerate(self._read(self._noted)):
+        for taken, note in enumerate(self._parts(set())):
             if taken == _MAX_NOTES:
                 raise RecordingError(f"{self.path} has more than {_MAX_NOTES} events")
-            if not isinstance(note, DataMessage):
-                for now in follow(timeline, note):
-                    changes[now.sensor].append(Since(note.stamp_ns, now))
+            assert isinstance(note, RecordedDescription | RecordedEvent)
+            for now in follow(timeline, note):
+                changes[now.sensor].append(Since(note.stamp_ns, now))
             if isinstance(note, RecordedEvent):
                 self.events.append(note)
         self.sensors: tuple[RecordedSensor, ...] = tuple(
@@ -149,14 +149,18 @@ class Recording(McapFile):
 
         RecordingError at the first corrupt part.
         """
-        frames = self._read(self._channels(sensor))
-        return cast(Iterator[DataMessage], frames)
+        return (each for each in self.everything(sensor) if isinstance(each, DataMessage))
 
     def everything(
         self, sensor: int | None = None
     ) -> Iterator[DataMessage | RecordedDescription | RecordedEvent]:
         """Descriptions, events and the frames of the sensor at this position, or of all, as they came."""
-        return self._read(self._channels(sensor) | self._noted)
+        for part in self._parts(self._channels(sensor)):
+            if isinstance(part, RecordedDescription | RecordedEvent):
+                yield part
+            else:
+                for row, position in zip(*part, strict=True):
+                    yield file_format.unpack_frame(message_in(row)[2], int(position))
 
     def tables(self, sensor: int | None = None) -> Iterator[Table | RecordedDescription | RecordedEvent]:
         """As `everything`, with the frames as arrays of a few thousand, which descriptions and events end."""
@@ -231,13 +235,6 @@ class Recording(McapFile):
 
     def _channels(self, sensor: int | None) -> set[int]:
         return {number for number, position in self._sensor_of.items() if sensor in (None, position)}
-
-    def _read(self, channels: set[int]) -> Iterator[DataMessage | RecordedDescription | RecordedEvent]:
-        for channel, log_time_ns, body in self.messages(channels):
-            if (position := self._sensor_of.get(channel)) is not None:
-                yield file_format.unpack_frame(body, position)
-            else:
-                yield self._note(channel, log_time_ns, body)
 
 
 def open_recording(path: Path) -> Recording:
