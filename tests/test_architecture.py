@@ -98,6 +98,7 @@ PACKAGES: Final[dict[str, set[str]]] = {
     "numpy": {B, C, "bota_clients"},
     "mcap": {"bota_clients.recording", "bota_clients.export.ros_topics"},
     "zstandard": {"bota_clients.recording"},
+    "lz4": {"bota_clients.recording"},
     "jinja2": {"bota_clients.report.page"},
     "rich": {"bota_clients"},
     "textual": {"bota_clients.monitor.app"},

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import ipaddress
+import re
+from typing import Final
 
 from bota_ethercat.address import Address
 from bota_ethercat.option_types import choice
@@ -11,6 +13,9 @@ from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.program import server_choice
 from bota_ethercat.program.arguments import typed, whole
 from bota_ethercat.sensor_choice import MAX_SENSORS
+
+_UNITS_S: Final = {"": 1, "s": 1, "m": 60, "h": 3600}  # by their first letter
+DURATION_UNIT: Final = "s(?:ec(?:ond)?s?)?|m(?:in(?:ute)?s?)?|h(?:(?:ou)?rs?)?"
 
 
 def add_server(parser: argparse.ArgumentParser) -> None:
@@ -42,6 +47,14 @@ def add_imu_units(parser: argparse.ArgumentParser) -> None:
         help="units in which the sensor sends acceleration and angular rate "
         f"(default {ImuUnits.G_DPS.value})",
     )  # fmt: skip
+
+
+def duration(text: str) -> float:
+    """Seconds in a text such as 30, 30s, 5min, 2h; ValueError."""
+    match = re.fullmatch(rf"([0-9]+(?:\.[0-9]+)?) ?({DURATION_UNIT}|)", text, re.ASCII)
+    if match and (value := float(match[1]) * _UNITS_S[match[2][:1]]) <= 1e9:
+        return value
+    raise ValueError
 
 
 def is_loopback(host: str) -> bool:

@@ -22,7 +22,7 @@ from bota_ethercat.settings import (
     SettingValue,
     check_combination,
     check_settings,
-    setting_named,
+    parse_assignment,
     start_up_defaults,
 )
 from bota_ethercat.text.did_you_mean import did_you_mean
@@ -349,11 +349,8 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, SettingValue]:
     """The settings in NAME=VALUE arguments; UsageError names the one that is wrong."""
     values: dict[str, SettingValue] = {}
     for assignment in assignments:
-        name, equals, text = assignment.partition("=")
-        if not equals:
-            raise UsageError(f"--set {assignment}: it must be NAME=VALUE, for example --set sinc_length=64")
         try:
-            values[name.strip()] = setting_named(name.strip()).parse(text)
+            name, values[name] = parse_assignment(assignment)
         except SettingError as error:
             raise UsageError(f"--set {assignment}: {error}") from None
     return values

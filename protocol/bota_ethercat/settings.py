@@ -133,6 +133,14 @@ def setting_named(name: str) -> Setting:
     return SETTINGS[name]
 
 
+def parse_assignment(text: str) -> tuple[str, SettingValue]:
+    """Name and value in NAME=VALUE; SettingError."""
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise SettingError("it must be NAME=VALUE, for example --set sinc_length=64")
+    return name.strip(), setting_named(name.strip()).parse(value)
+
+
 def check_settings(values: Mapping[str, object]) -> dict[str, SettingValue]:
     """Return `values` if every name exists and every value is allowed; else raise SettingError."""
     rows = {name: setting_named(name) for name in values}

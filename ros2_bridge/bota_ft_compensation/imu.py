@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
 from typing import Final
 
@@ -14,6 +13,7 @@ from bota_ethercat.pdo import STANDARD_GRAVITY, Sample, Vector3
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.sensor.frames import IMU_HEIGHTS
 from bota_ethercat.stream.timeline import InForce
+from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, judge
 from bota_ft_compensation.alignment import Array, align
 from bota_ft_compensation.quantities import (
     EXACT,
@@ -27,9 +27,13 @@ from bota_ft_compensation.quantities import (
     length,
 )
 from bota_ft_compensation.specific_force import ImuSpecificForce
+from bota_ft_compensation.stationary import triple
 
-# Of a check of gravity: looks, s apart; rad/s, and m/s² between looks, that are rest; m/s² that is wrong.
-_LOOKS, _APART_S, _RESTING, _STEADY, _WRONG = 3, 0.5, 0.1, 0.3, 2.0
+# Of a check of gravity: looks, s apart on average, and at most; rad/s, and m/s² of deviation, that are rest;
+# m/s² that is wrong.
+_LOOKS, _APART_S, _MOST_S, _RESTING, _STEADY, _WRONG = 50, 0.02, 0.2, 0.1, 0.3, 2.0
+_UNEVEN: Final = 0.5 * (math.sqrt(5.0) - 1.0)
+_READ: Final = (ACCELERATION, ANGULAR_RATE)
 IMU_IS_OFF: Final = "the accelerometer reads zero: switch the IMU on (settings.imu_active)"
 
 
@@ -129,26 +133,41 @@ class ImuSource(Source):
 
 
 class GravityCheck:
-    """Whether gravity by a source looks right to the sensor's accelerometer, while the sensor is at rest."""
+    """Whether gravity by a source looks right to the sensor's accelerometer, while the sensor is at rest.
+
+    A second or more of looks at uneven intervals: what moves to and fro, at whatever frequency, is no rest,
+    and what is steady for so long is gravity. For the thread that has the samples.
+    """
 
     def __init__(self) -> None:
-        self._looks = deque[tuple[float, Vector3, Vector3]](maxlen=_LOOKS)
         self.problem = ""  # what is wrong and what to do, a clause
+        self.due_s = -math.inf  # of the next look
+        self._rows, self._last_s = list[tuple[Sample, Vector3]](), -math.inf
 
     def look(self, sample: Sample, felt: Vector3 | None, time_s: float, *, by_imu: bool) -> None:
-        """About once a second, with a sample and the specific force that the source gave for it, m/s²."""
-        looks, read = self._looks, sample.acceleration
-        if looks and 0.0 <= time_s - looks[-1][0] < _APART_S:
+        """At the first sample from `due_s` on, and the specific force that the source gave for it, m/s²."""
+        rows, passed_s, self._last_s = self._rows, time_s - self._last_s, time_s
+        if not 0.0 < passed_s <= _MOST_S:
+            rows.clear()
+        self.due_s = time_s + _APART_S * (0.5 + len(rows) * _UNEVEN % 1.0)
+        if felt is None:
+            rows.clear()
             return
-        if felt is None or not any(read) or not sample.is_finite or length(sample.angular_rate) > _RESTING:
-            looks.clear()
-            return
-        looks.append((time_s, read, felt))
-        first, *rest = looks
-        if len(looks) == _LOOKS and all(
-            math.dist(a, b) < _STEADY for each in rest for a, b in zip(each[1:], first[1:], strict=True)
-        ):
-            self.problem = _gravity_problem(read, felt, by_imu=by_imu)
+        rows.append((sample, felt))
+        if len(rows) == _LOOKS:
+            if not any(judge(each, _READ)[1] or not any(each.acceleration) for each, _ in rows):
+                self._judge(
+                    np.array([(*each.acceleration, *each.angular_rate, *at) for each, at in rows]), by_imu
+                )
+            rows.clear()
+
+    def _judge(self, rows: Array, by_imu: bool) -> None:
+        read, rate, felt = np.split(rows.mean(axis=0), 3)
+        size = math.hypot(*read)
+        # Of nothing at rest is it so small: then the rate's unit is as wrong.
+        turns = math.hypot(*rate) > _RESTING and size > _WRONG
+        if not turns and rows[:, :3].std(axis=0).max() < _STEADY * max(1.0, size / STANDARD_GRAVITY):
+            self.problem = _gravity_problem(triple(read), triple(felt), by_imu=by_imu)
 
 
 def _gravity_problem(read: Vector3, felt: Vector3, *, by_imu: bool) -> str:

@@ -38,14 +38,15 @@ from bota_ft_compensation.quantities import (
 _TURNING: Final = 0.05  # rad/s: less is a gyroscope's offset
 _PUSHED: Final = 0.5  # m/s²: less is an accelerometer's noise
 Row = tuple[float, ...]
+_ROOM: Final = 16  # times as many rows as are needed
 _MOST_RATES: Final = 4096  # remembered for orientations that come late: 2.5 s at 1600 Hz
 
 
 class ImuSpecificForce:
     """From the sensor's accelerometer and gyroscope, sample by sample.
 
-    It keeps as many samples as the alignment needs, with those that were lost interpolated, in a ring that
-    has every row twice, so that the newest are in one piece.
+    It keeps as many samples as the alignment needs, with those that were lost interpolated, in one piece: the
+    newest rows of an array, which are moved to its front when it is full.
     """
 
     def __init__(
@@ -70,8 +71,8 @@ class ImuSpecificForce:
         """Bring what follows to the instant of force and torque so."""
         self.alignment = alignment
         self._size = alignment.taps.shape[1]
-        self._ring = np.zeros((2 * self._size, 6))
-        self._at = self._filled = 0
+        self._rows = np.zeros((_ROOM * self._size, 6))
+        self._end, self._filled = self._size, 0
         self._moved = False  # before the latest gap, or in it
         self._time_s = -math.inf
 
@@ -97,14 +98,14 @@ class ImuSpecificForce:
                 self._continue_back()
         else:
             if filled:
-                before = self._ring[self._at + 1 : self._at + self._size + 1]
+                before = self._rows[self._end - self._size : self._end]
                 turned, pushed = (before[:, 3:] ** 2).sum(axis=1), math.dist(before[-1, :3], row[:3])
                 self._moved = bool(turned.max() > _TURNING**2) or pushed > _PUSHED
-            self._filled = 1
-            self._ring[:] = row
+            self._filled, self._end = 1, self._size
+            self._rows[: self._size] = row
         if self._filled < lead and (dx or dy or dz) and (self._moved or _turns(angular_rate)):
             return None
-        found = self.alignment.taps.dot(self._ring[self._at + 1 : self._at + self._size + 1])
+        found = self.alignment.taps.dot(self._rows[self._end - self._size : self._end])
         felt, self.turning = self._at_center(found.dot(self._corrected).tolist())
         return felt
 
@@ -128,13 +129,13 @@ class ImuSpecificForce:
                 felt[:, begin], turned[:, :, begin], begin = now or math.nan, self.turning, begin + 1
                 continue
             end = ends[begin]
-            held = np.concatenate([self._ring[self._at + 2 : self._at + size + 1], rows[begin:end]])
+            held = np.concatenate([self._rows[self._end - size + 1 : self._end], rows[begin:end]])
             # Multiplied one by one: the sums of a larger product would be in another order.
             found = self.alignment.taps @ sliding_window_view(held, size, axis=0).swapaxes(1, 2)
             part, begin = slice(begin, end), end
             felt[:, part], turned[:, :, part] = self._at_center(np.moveaxis(found @ self._corrected, 0, 2))
-            self._ring[:size] = self._ring[size:] = held[-size:]
-            self._at, self._filled = size - 1, self._filled + len(found)
+            self._rows[:size] = held[-size:]
+            self._end, self._filled = size, self._filled + len(found)
             self._time_s = times[end - 1].item()
             (wx, wy, wz), (tx, ty, tz) = turned[:, :, end - 1].tolist()
             self.turning = (wx, wy, wz), (tx, ty, tz)
@@ -154,26 +155,27 @@ class ImuSpecificForce:
 
     def _bridge(self, row: Row, passed_s: float) -> None:
         """The samples that were lost before one that comes so long after the one before."""
-        periods, before = round(passed_s / self.alignment.period_s), self._ring[self._at].copy()
+        periods, before = round(passed_s / self.alignment.period_s), self._rows[self._end - 1].copy()
         for lost in range(1, periods):
             self._append(before + lost / periods * (row - before))
 
     def _continue_back(self) -> None:
         """What precedes the samples since a gap, on the line through them."""
-        ring, size = self._ring, self._size
-        known = min(self._filled, size)
-        since = ring[self._at + size - known + 1 : self._at + size + 1].copy()
+        size, known = self._size, min(self._filled, self._size)
+        since = self._rows[self._end - known : self._end].copy()
         steps = np.arange(known) - 0.5 * (known - 1)
         slope = steps @ since / (steps @ steps)
         before = since.mean(axis=0) + (steps[0] - np.arange(size - known, 0, -1)[:, np.newaxis]) * slope
-        ring[:size] = ring[size:] = np.concatenate([before, since])
-        self._at = size - 1
+        self._rows[:size] = np.concatenate([before, since])
+        self._end = size
 
     def _append(self, row: Row | Array) -> None:
         self._filled += 1
-        self._at = at = (self._at + 1) % self._size
-        self._ring[at] = row
-        self._ring[at + self._size] = self._ring[at]  # faster than from numbers again
+        if self._end == len(self._rows):
+            self._rows[: self._size] = self._rows[-self._size :]
+            self._end = self._size
+        self._rows[self._end] = row
+        self._end += 1
 
 
 def _turns(rate: Sequence[float]) -> bool:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from pyarrow import parquet
 from rosbags.highlevel import AnyReader
 
@@ -34,11 +35,8 @@ def numbers(message: Any, name: str) -> list[float]:
     "name", ["gaps", "not_finite", "lost_and_back", "offset_written", "larger_process_data"]
 )
 def test_every_number_is_that_of_the_table(name: str, has_tool: bool, tmp_path: Path) -> None:
-    run, bag, table = (
-        recorded(STREAMS[name], tmp_path / "run.mcap"),
-        tmp_path / "ros.mcap",
-        tmp_path / "t.parquet",
-    )
+    run, bag, table = (tmp_path / each for each in ("run.mcap", "ros.mcap", "t.parquet"))
+    recorded(STREAMS[name], run)
     tool = tmp_path / "tool.yaml"
     write_payload(tool, TOOL, "", [("bias", BIAS.values, ""), ("sensor_offset", OFFSET, "")])
     more = ["--sensor", 0, *(["--tool", tool] if has_tool else [])]
@@ -71,10 +69,14 @@ def test_every_number_is_that_of_the_table(name: str, has_tool: bool, tmp_path: 
         assert 0 < len(rows) <= len(stamps)
 
 
-def test_an_imu_message_has_no_orientation_and_a_file_is_not_replaced(tmp_path: Path) -> None:
+def test_definitions_are_those_of_ros_2_and_an_imu_has_no_orientation(tmp_path: Path) -> None:
     run, bag = recorded(STREAMS["plain"], tmp_path / "run.mcap"), tmp_path / "ros.mcap"
     assert run_here(main, run, "--ros", bag).code == 0
     assert "exists" in run_here(main, run, "--ros", bag).err
+    with bag.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    for schema in summary.schemas.values() if summary else ():
+        assert "\nMSG: builtin_interfaces/Time\n" in schema.data.decode()
     with AnyReader([bag]) as reader:
         (imu,) = (each for each in reader.connections if each.topic == "/imu/data_raw")
         _, _, data = next(reader.messages([imu]))

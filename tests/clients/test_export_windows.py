@@ -393,7 +393,7 @@ PAGES = (DOCS / "datasets.md").read_text() + (DOCS / "recording.md").read_text()
 
 
 @pytest.mark.timeout(600)  # a cluster of Ray begins
-@pytest.mark.filterwarnings("ignore:::ray", "ignore:::dask")
+@pytest.mark.filterwarnings("ignore:::ray")
 @pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", PAGES, re.DOTALL))
 def test_the_code_of_the_pages_runs(
     code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
@@ -417,16 +417,19 @@ def test_the_code_of_the_pages_runs(
         ray.init(num_cpus=2, include_dashboard=False)
         request.addfinalizer(ray.shutdown)
     if "lerobot" in code:
-        lerobot, state = (
-            importlib.import_module("lerobot.datasets.lerobot_dataset"),
-            {"shape": (2,), "names": None},
-        )
-        features = {"state": {"dtype": "float32", **state}}
-        made = lerobot.LeRobotDataset.create("me/run", 30, features, "run", use_videos=False)
-        for number in range(38):
-            made.add_frame({"state": np.array([number, 0], np.float32), "task": "none"})
-        made.save_episode()
+        datasets = importlib.import_module("lerobot.datasets.lerobot_dataset")
+        features = {name: {"dtype": kind, "shape": (size,), "names": None}
+                    for name, kind, size in (("state", "float32", 2), ("stamp_ns", "int64", 1))}  # fmt: skip
+        made = datasets.LeRobotDataset.create("me/run", 30, features, "run", use_videos=False)
+        stamps = np.load("run.npz")["stamp_ns"]
+        for number, stamp in enumerate(stamps):
+            row = {"state": np.array([number, 0], np.float32), "stamp_ns": np.array([stamp])}
+            made.add_frame(row | {"task": "none"})
+            if number in (9, 29, len(stamps) - 1):
+                made.save_episode()
         made.finalize()
+        data = Path("run/data/chunk-000/file-000.parquet")
+        np.testing.assert_array_equal(read_stamps(data, "stamp_ns"), stamps)
     found: dict[str, Any] = {}
     if "LiveWindows" in code:
         _run_live(code, monkeypatch)
@@ -438,8 +441,7 @@ def test_the_code_of_the_pages_runs(
     assert len(found.get("force", range(1000))) == 1000
     assert np.shape(found.get("force_torque", np.zeros((38, 32, 6)))) == (38, 32, 6)
     if "lerobot" in code:
-        dataset = found["LeRobotDataset"]("me/with_force", root="with_force")
-        _check_lerobot(dataset, np.load("run.npz"))
+        _check_lerobot(found, np.load("run.npz"))
 
 
 def _run_live(code: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -463,19 +465,44 @@ def _run_live(code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [int(valid.sum()) > 50 for *_, valid in acted] == [True] * 3
 
 
-def _check_lerobot(dataset: Any, arrays: Any) -> None:
-    """A frame, the statistics without empty slots, and a batch as LeRobot normalizes it with them."""
-    key = "observation.force_torque"
+def _check_lerobot(found: dict[str, Any], arrays: Any) -> None:
+    """A frame; statistics without empty slots, after LeRobot's tools, too; a batch normalized with them."""
+    key, tools = "observation.force_torque", importlib.import_module("lerobot.datasets.dataset_tools")
+    wrench, valid = arrays["force_torque"], arrays["force_torque_valid"]
+    assert not valid.all(), "or there is nothing to leave out"
+
+    def opened(root: str) -> Any:
+        return found["LeRobotDataset"](f"me/{root}", root=root)
+
+    def is_right(root: str, rows: list[int]) -> bool:
+        stats, measured = found["load_stats"](Path(root)), wrench[rows][valid[rows]]
+        quantiles = {
+            name: np.quantile(measured, part, axis=0) for name, part in (("q01", 0.01), ("q90", 0.9))
+        }
+        return {*stats.get(key, ())} == {*stats["state"]} and all(
+            np.allclose(stats[key][name], np.tile(value, 32), atol=1.0) for name, value in quantiles.items()
+        )
+
+    dataset, rows = opened("with_force"), [*range(len(valid))]
+    assert is_right("with_force", rows)
     frame_20 = dataset[20]
     assert frame_20[key].reshape(32, 6)[-1, 0] == 20 * 800 // 30 + 1
-    written = json.loads(Path("with_force/meta/stats.json").read_text())
-    empty = np.isnan(arrays["force_torque"]).any(axis=2)
-    assert empty.any(), "or there is nothing to leave out"
-    measured = arrays["force_torque"][~empty]
-    assert {*written[key]} == {*written["state"]}
-    for name, wanted in (("min", measured.min(axis=0)), ("mean", measured.mean(axis=0)),
-                         ("q90", np.quantile(measured, 0.9, axis=0))):  # fmt: skip
-        np.testing.assert_allclose(written[key][name], np.tile(wanted, 32), rtol=1e-6)
+    shutil.copytree("with_force", "again")
+    changes: dict[str, tuple[list[int], Any]] = {
+        "deleted": (rows[10:], lambda: tools.delete_episodes(dataset, [0], "deleted", "me/deleted")),
+        "split/a": (rows[:30], lambda: tools.split_dataset(dataset, {"a": [0, 1]}, "split")),
+        "merged": (
+            rows + rows[10:],
+            lambda: tools.merge_datasets([dataset, opened("deleted")], "m", "merged"),
+        ),
+        "again": (rows, lambda: tools.recompute_stats(opened("again"))),
+    }
+    for root, (its_rows, change) in changes.items():
+        change()
+        assert not is_right(root, its_rows), f"{root}: this is no longer needed"
+        found["write_wrench_stats"](Path(root))
+        assert is_right(root, its_rows), root
+    measured = wrench[valid]
     types = importlib.import_module("lerobot.configs.types")
     step = importlib.import_module("lerobot.processor.normalize_processor").NormalizerProcessorStep
     state, mode = types.FeatureType.STATE, types.NormalizationMode.MEAN_STD

@@ -17,11 +17,11 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from bota_clients.errors import RecordingError
+from bota_clients.identify.last_offset import AtLastOffset
 from bota_clients.recording import file_format
 from bota_clients.recording.columns import RECORD, columns, joined, table_of
 from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
 from bota_clients.recording.mcap_file import MAX_CHUNK, McapFile
-from bota_clients.recording.order import AtLastOffset
 from bota_clients.recording.reader import open_recording
 from bota_clients.report.series import of_recording
 from bota_ethercat.framing import DataFlag, DataMessage
@@ -371,15 +371,14 @@ def test_every_topic_and_schema_is_described() -> None:
 
 
 def test_the_bytes_of_a_frame_are_as_described() -> None:
-    rows = re.findall(r"^\| (\d+) \| (\w+) \| `(\w+)`", DOCS, re.MULTILINE)
-    formats = {"u8": "<B", "u16": "<H", "u64": "<Q"}
+    text = DOCS[DOCS.index("`bota_ethercat/msg/Frame` is") : DOCS.index("u32 length")]
     item = frame(7, sensor=3, flags=5)
     body = file_format.pack_frame(item)
-    seen = {
-        name: struct.unpack_from(formats[kind], body, int(at))[0]
-        for at, kind, name in rows
-        if kind in formats
-    }
+    at, size, seen = 4, 0, dict[str, int]()
+    for bits, name in re.findall(r"u(\d+)\s|`(\w+)`", text):
+        size = int(bits) // 8 if bits else size
+        if name:
+            at, seen[name] = at + size, int.from_bytes(body[at : at + size], "little")
     assert seen == dict(zip(DataMessage._fields[:6], item[:6], strict=True))
     assert body.startswith(bytes.fromhex("00010000"))
     assert struct.unpack_from("<I", body, 32) == (len(item.process_data),)

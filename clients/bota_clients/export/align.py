@@ -30,6 +30,7 @@ from bota_clients.export.dataset import MOST_LEFT_OUT, ForeignClock, messages
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.program import interrupt_on_signals, say
+from bota_clients.recording.asked import Asked
 from bota_clients.recording.columns import Ints
 from bota_clients.recording.order import TimeAxis, in_order
 from bota_clients.recording.reader import open_recording
@@ -318,7 +319,7 @@ def _turned(vectors: Array) -> Array:
 
 def run(options: argparse.Namespace) -> int:
     interrupt_on_signals()
-    with open_recording(options.recording) as recording:
+    with open_recording(options.recording, Asked.of(options)) as recording:
         rows, axis = [], TimeAxis()
         batches = recording.batches(choose(recording, options.sensor).sensor, options.imu_units)
         for in_force, frames in axis.batches(batches):

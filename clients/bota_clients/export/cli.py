@@ -9,8 +9,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Final
 
-from bota_clients.arguments import add_force, add_imu_units, position
+from bota_clients.arguments import add_force, position
 from bota_clients.program import interrupt_on_signals, say, start
+from bota_clients.recording.asked import Asked, add_reading
 from bota_ethercat.errors import FileError
 from bota_ethercat.program.arguments import Parser, number
 from bota_ethercat.program.output import ends_with_its_reader
@@ -81,6 +82,8 @@ def _checked(made: Parser, options: argparse.Namespace) -> argparse.Namespace:
         made.error(
             "--mcap writes the messages as they are: omit the other output, --all, --tool, --at, --fps"
         )
+    if options.mcap and (options.rate or options.assignments):
+        made.error("--mcap writes the messages as they are: omit --rate, --set")
     if options.ros and (options.output or options.mcap or options.all or has_frames):
         made.error("--ros writes all samples: omit the other output, --mcap, --all, --at, --fps")
     if not options.recording.name:
@@ -131,7 +134,7 @@ def _add_recording(made: argparse.ArgumentParser) -> None:
     add = made.add_argument
     add("recording", type=Path, metavar="RECORDING", help="a recording of ethercat-record")
     add("--sensor", type=position, metavar="N", help="only the sensor at this position on the bus")
-    add_imu_units(made)
+    add_reading(made)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -139,19 +142,16 @@ def run(options: argparse.Namespace) -> int:
 
     Ctrl-C ends it at any time and leaves no file.
     """
-    from bota_clients.recording.reader import REWRITTEN, open_recording  # noqa: PLC0415 - needs the extra
+    from bota_clients.recording.reader import open_recording  # noqa: PLC0415 - needs the extra
 
     module = "dataset" if options.suffix in DATASETS else "csv_table"
     module = "whole" if options.mcap else "ros_topics" if options.ros else module
     write = import_module(f"bota_clients.export.{module}").write
     interrupt_on_signals()
     try:
-        with open_recording(options.recording) as recording:
-            if recording.cut_off is not None:
-                how = f"was cut off ({recording.cut_off}): the intact part is exported"
-                say(PROGRAM, f"{recording.path} {how}")
-            if recording.is_rewritten:
-                say(PROGRAM, f"{recording.path} {REWRITTEN}")
+        with open_recording(options.recording, Asked.of(options)) as recording:
+            for remark in recording.remarks:
+                say(PROGRAM, f"{recording.path} {remark}")
             written = write(options, recording)
     except OSError as error:
         raise FileError(f"{options.output} cannot be written: {error.strerror or error}") from None

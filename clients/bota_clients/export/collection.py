@@ -24,12 +24,13 @@ from typing import Any, Final, NamedTuple
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import PROGRAM
 from bota_clients.export.dataset import about, arrow_of, in_chunks, parquet_writer, windows_for
-from bota_clients.export.samples import MOST_LOST, samples_of
+from bota_clients.export.samples import MOST_LOST, in_part, samples_of
 from bota_clients.export.windows import read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.program import interrupt_on_signals, say
 from bota_clients.progress import progress, switch_off
+from bota_clients.recording.asked import Asked
 from bota_clients.recording.reader import Recording, open_recording
 from bota_ethercat.errors import FileError, ProtocolError
 from bota_ethercat.program.version import VERSION
@@ -54,7 +55,8 @@ def tables_of(options: argparse.Namespace, recording: Recording, sensor: int | N
     chosen = choose(recording, sensor)
     windows = windows_for(options, recording, chosen, MOST_LOST)
     said = json.dumps(about(options, recording, chosen, tool=windows.tool), default=str)
-    for block in in_chunks(samples_of(recording, windows, chosen.sensor), _GROUP):
+    blocks = in_part(recording, windows, samples_of(recording, windows, chosen.sensor))
+    for block in in_chunks(blocks, _GROUP):
         rows = arrow_of(block, said)
         numbers = pa.repeat(pa.scalar(0, pa.int32()), len(rows))
         yield rows.append_column("recording", pa.DictionaryArray.from_arrays(numbers, [recording.path.name]))
@@ -67,6 +69,7 @@ def _source(path: Path, options: argparse.Namespace) -> tuple[str, str]:
         found = os.fstat(file.fileno())
     tool = options.tool and hashlib.sha256(options.tool.read_bytes()).hexdigest()
     made_of = [found.st_size, found.st_mtime_ns, tool, options.imu_units.value, options.sensor, VERSION]
+    made_of += [*Asked.of(options)]
     return f"{path.stem}-{digest}.parquet", json.dumps(made_of)
 
 
@@ -95,7 +98,7 @@ def add(path: Path, options: argparse.Namespace) -> Done:
         unfinished = tempfile.TemporaryDirectory(
             prefix=".unfinished-", dir=folder, ignore_cleanup_errors=True
         )
-        with open_recording(path) as recording, unfinished as beside:
+        with open_recording(path, Asked.of(options)) as recording, unfinished as beside:
             sensors = [each.sensor for each in recording.sensors if each.frames]
             if options.sensor is not None:
                 sensors = [choose(recording, options.sensor).sensor]

@@ -67,7 +67,7 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     rows, axis, first_ns, new = 0, TimeAxis(), -1, NewSamples()
     with NewFile(options.output, force=options.force) as file:
         file.write(",".join(COLUMNS) + "\n")
-        tables = recording.tables(options.sensor)
+        tables = recording.tables(options.sensor, is_whole=True)
         for table in (each for each in tables if isinstance(each, np.ndarray)):
             flags, is_kept = table["flags"].astype(np.int64), np.ones(len(table), bool)
             if not options.all:
@@ -79,12 +79,14 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
             if first_ns < 0 and len(found):  # of several sensors another's may be the earliest
                 moments = found.monotonic_ns[:_BEGIN]
                 first_ns = int(moments[moments > moments[0] - _SECOND].min())
-            places = axis.places(found.monotonic_ns, found.stamp_ns)
-            file.write("".join(_lines(kept, found, flags[is_kept], places, first_ns)))
-            rows += len(found)
+            places, flags = axis.places(found.monotonic_ns, found.stamp_ns), flags[is_kept]
+            held = recording.asked.holds(found.stamp_ns, places - first_ns)
+            written = _lines(kept[held], found.where(held), flags[held], places[held], first_ns)
+            file.write("".join(written))
+            rows += int(held.sum())
         file.finish()
     left_out = (sum(there.values()) if options.sensor is None else there[options.sensor]) - rows
-    left = f"; {count(left_out, 'frame')} without a new sample left out" if left_out else ""
+    left = f"; {count(left_out, 'frame')} without a new sample left out" if left_out > 0 else ""
     return "; ".join([f"{count(rows, 'sample')}{left}", *axis.said])
 
 

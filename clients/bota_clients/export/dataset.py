@@ -32,7 +32,7 @@ import numpy as np
 
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import DATASETS, PROGRAM
-from bota_clients.export.samples import MOST_LOST, samples_of
+from bota_clients.export.samples import MOST_LOST, in_part, samples_of
 from bota_clients.export.windows import Arrays, Windows, interpolated, read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
@@ -166,7 +166,7 @@ class Stamped:
         """
         self._leave_out(recording, sensor)
         stamps, is_near = self._stamps, self._clock is None and not self.strict
-        new = (part.stamp_ns[part.fresh] for _, part in recording.batches(sensor))
+        new = (part.stamp_ns[part.fresh] for _, part in recording.batches(sensor, is_whole=True))
         first_ns = next((int(part[0]) for part in new if len(part)), 0)
         if is_near and first_ns - _NEAR_NS < stamps[0] < first_ns:
             lowest_ns = min((int(part.min(initial=first_ns)) for part in new), default=first_ns)
@@ -178,7 +178,7 @@ class Stamped:
         kept = in_order(self._stamps)
         if self._clock is None and not kept.all():
             clocks, steps = np.zeros((2, 0), np.int64), list[Ints]()
-            for _, each in TimeAxis().batches(recording.batches(sensor)):
+            for _, each in TimeAxis().batches(recording.batches(sensor, is_whole=True)):
                 new = np.stack([each.stamp_ns, each.monotonic_ns])[:, each.fresh]
                 clocks = np.hstack([clocks[:, -1:], new])
                 last = np.flatnonzero(np.diff(clocks[0]) < 0)  # before each step back
@@ -391,7 +391,7 @@ def windows_of(
     if stamped is not None:
         stamped.begin(recording, sensor)
     done, first, clocks, waiting = 0, *(np.zeros((2, 0), np.int64) for _ in range(3))
-    batches = (axis or TimeAxis()).batches(recording.batches(sensor, windows.imu_units))
+    batches = (axis or TimeAxis()).batches(recording.batches(sensor, windows.imu_units, is_whole=True))
     for in_force, batch in itertools.chain(batches, [(None, None)]):
         until_ns = windows.until_ns
         if in_force is not None and batch is not None:
@@ -465,9 +465,11 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     ) as folder:
         made, tally = Path(folder, path.name), Counter[bool]()
         if frames:
-            blocks = in_chunks(windows_of(recording, frames, windows, sensor.sensor, axis), _CHUNK)
+            blocks = windows_of(recording, frames, windows, sensor.sensor, axis)
         else:
-            blocks = in_chunks(samples_of(recording, windows, sensor.sensor, axis), _GROUP)
+            blocks = samples_of(recording, windows, sensor.sensor, axis)
+        blocks = in_chunks(in_part(recording, windows, blocks), _CHUNK if frames else _GROUP)
+        if not frames:
             blocks = _tallied(blocks, tally)
         _WRITERS[options.suffix](made, said, blocks)
         if path.is_dir():

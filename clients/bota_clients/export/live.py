@@ -13,6 +13,7 @@ to the sensor's own offset marks the same samples if the server says so beforeha
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +23,7 @@ from bota_clients.export.windows import Arrays, Windows, interpolated, read_tool
 from bota_clients.recording.columns import columns
 from bota_clients.recording.order import TimeAxis
 from bota_ethercat.client import Client
+from bota_ethercat.client.session import Item
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.stream.timeline import InForce
@@ -55,6 +57,7 @@ class LiveWindows:
         self._windows = Windows(length, tool=read_tool(tool) if tool else None, imu_units=imu_units)
         self._axis, self._keep_ns, self._shift_ns = TimeAxis(), round(keep_s * 1e9), 0
         self._in_force: InForce | None = None
+        self._never = threading.Event()
         self._clocks = np.zeros((2, 0), np.int64)  # of the samples that are kept: both stamps
 
     def at(
@@ -68,18 +71,38 @@ class LiveWindows:
         Call it at least every second, so that no samples pile up. RecordingError if the sampling rate is
         unknown.
         """
-        monotonic = self._client.channel.monotonic_ns
-        deadline_ns, windows = monotonic() + round(timeout_s * 1e9), self._windows
-        self._take(0.0)
-        while (instant := self._instant(stamp_ns, monotonic_ns)) > windows.until_ns or not self._clocks.size:
-            if (left_ns := deadline_ns - monotonic()) <= 0:
-                break
-            self._take(left_ns * 1e-9)
+        channel, windows, items = self._client.channel, self._windows, list(self._client.poll_all(0.0))
+        deadline_ns = channel.monotonic_ns() + round(timeout_s * 1e9)
+        while True:
+            left_ns = deadline_ns - channel.monotonic_ns()
+            early_ns = min(max(self._early_ns(items, stamp_ns, monotonic_ns), 0), left_ns)
+            if left_ns <= 0 or early_ns <= 0:
+                self._take(items)
+                instant, items = self._instant(stamp_ns, monotonic_ns), []
+                if left_ns <= 0 or (self._clocks.size and instant <= windows.until_ns):
+                    break
+            else:
+                channel.wait(self._never, early_ns * 1e-9)
+            items += self._client.poll_all((left_ns - early_ns) * 1e-9)
         found = windows.at(np.array([instant]), is_partial=True)
         return {name: array[0] for name, array in found.items()} | {
             "monotonic_ns": np.array(instant - self._shift_ns),
             "is_complete": np.array(0 <= instant <= windows.until_ns),
         }
+
+    def _early_ns(self, items: list[Item], stamp_ns: int | None, monotonic_ns: int | None) -> int:
+        """How long before the instant the newest of these frames was measured; 0: it was not.
+
+        Frames wait for each other, as many at once cost what one does.
+        """
+        frames = (each for each in reversed(items) if isinstance(each, DataMessage))
+        newest = next((each for each in frames if each.sensor == self._sensor), None)
+        if newest is None or not self._clocks.size:
+            return 0
+        delay_ns = int(self._clocks[1, -1]) - self._windows.until_ns
+        if monotonic_ns is not None:
+            return monotonic_ns + delay_ns - newest.monotonic_ns
+        return 0 if stamp_ns is None else stamp_ns + delay_ns - newest.stamp_ns
 
     def _instant(self, stamp_ns: int | None, monotonic_ns: int | None) -> int:
         """On the axis of the windows; -1 if nothing is known."""
@@ -95,10 +118,9 @@ class LiveWindows:
         nearest = 0 if stamp_ns < stamps[0] else -1
         return int(instants[nearest]) + stamp_ns - int(stamps[nearest])
 
-    def _take(self, timeout_s: float) -> None:
-        """What has arrived, or what arrives next."""
+    def _take(self, items: list[Item]) -> None:
         frames = list[DataMessage]()
-        for item in [*self._client.poll_all(timeout_s), None]:
+        for item in [*items, None]:
             if isinstance(item, DataMessage):
                 if item.sensor == self._sensor:
                     frames.append(item)

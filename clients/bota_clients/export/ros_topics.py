@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from bota_clients.export.cli import PROGRAM
 from bota_clients.export.dataset import windows_for
-from bota_clients.export.samples import MOST_LOST, samples_of
+from bota_clients.export.samples import MOST_LOST, in_part, samples_of
 from bota_clients.export.windows import Arrays
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
@@ -89,7 +89,7 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
         writer.start("ros2", f"{PROGRAM} {VERSION}")
         wanted = [topic for topic in TOPICS if windows.stream or not topic.valid]
         senders, sent = [_Sender(writer, topic) for topic in wanted], 0
-        for block in samples_of(recording, windows, sensor.sensor):
+        for block in in_part(recording, windows, samples_of(recording, windows, sensor.sensor)):
             sent += sum(each.send(block) for each in senders)
             disk.flush()
         writer.finish()
@@ -101,7 +101,7 @@ class _Sender:
     """Writes one topic."""
 
     def __init__(self, writer: Writer, topic: Topic) -> None:
-        definition = _STORE.generate_msgdef(topic.kind)[0]
+        definition = _STORE.generate_msgdef(topic.kind, ros_version=2)[0]
         schema = writer.register_schema(topic.kind, "ros2msg", definition.encode())
         self._writer, self._topic, self._sequence = writer, topic, 0
         self._channel = writer.register_channel(f"/{topic.name}", "cdr", schema)

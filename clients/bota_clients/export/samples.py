@@ -33,7 +33,7 @@ def samples_of(
 
     On `axis`, by default a new one. RecordingError.
     """
-    batches = (axis or TimeAxis()).batches(recording.batches(sensor, windows.imu_units))
+    batches = (axis or TimeAxis()).batches(recording.batches(sensor, windows.imu_units, is_whole=True))
     held, first_ns, new = list[Columns](), 0, NewSamples()
     begin, taken = 0, 0  # samples: number of the first that is held, and how many were taken
     for in_force, batch in itertools.chain(batches, [(None, None)]):
@@ -53,6 +53,22 @@ def samples_of(
         held, begin = [held[0].where(slice(keep - begin, None))], keep
     if not taken:
         raise RecordingError(f"{recording.path} has no new and valid samples")
+
+
+def in_part(recording: Recording, windows: Windows, blocks: Iterator[Arrays]) -> Iterator[Arrays]:
+    """Of blocks of the whole the rows of the part that is asked for; RecordingError if there are none.
+
+    So the filters of the compensation have seen what came before it.
+    """
+    rows = 0
+    for block in blocks:
+        stamps = block["stamp_ns" if "stamp_ns" in block else "stamp_utc"].astype(np.int64)
+        held = recording.asked.holds(stamps, block["monotonic_ns"] - windows.begin_ns)
+        rows += int(held.sum())
+        if held.any():
+            yield block if held.all() else {name: array[held] for name, array in block.items()}
+    if not rows:
+        raise RecordingError(f"{recording.path} has nothing to export {recording.asked.part}")
 
 
 def _rows(slots: Array, samples: Columns, index: Array, first_ns: int, *, tool: bool) -> Arrays:

@@ -45,6 +45,7 @@ _SLOT: Final = np.dtype([
     ("sequence", "i8"),  # -1: there was no such frame, or it is not known which
     ("number", "i8"),  # of the sample, from 0 on; -1: empty
 ])  # fmt: skip
+_WHOLE: Final = np.dtype((np.void, _SLOT.itemsize))  # a slot copied at once, and not field by field
 
 
 def interpolated(at: Ints, here: Ints, there: Ints) -> Ints:
@@ -173,7 +174,7 @@ class Windows:
             (math.nan, math.nan) if self.stream is None else self.stream.compensate(samples)
         )
         self._until_ns = np.maximum(self._until_ns, slots["measured_ns"].max(axis=0))
-        self._slots = np.concatenate([self._slots, slots])
+        self._slots = np.concatenate([self._slots.view(_WHOLE), slots.view(_WHOLE)]).view(_SLOT)
         return samples
 
     def at(self, instants_ns: Ints, *, is_partial: bool = False) -> Arrays:

@@ -7,8 +7,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from bota_clients.arguments import add_force, add_imu_units, position
+from bota_clients.arguments import add_force, position
 from bota_clients.program import start
+from bota_clients.recording.asked import add_reading
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.program.arguments import Parser, number
 from bota_ethercat.program.output import ends_with_its_reader
@@ -53,7 +54,7 @@ def _add_recording(made: argparse.ArgumentParser) -> None:
     made.add_argument("path", type=Path, metavar="FILE.mcap", help="a recording of ethercat-record")
     made.add_argument("--sensor", type=position, metavar="N",
         help="position on the bus (default: the only one in the recording)")  # fmt: skip
-    add_imu_units(made)
+    add_reading(made)
 
 
 @ends_with_its_reader

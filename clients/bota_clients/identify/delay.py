@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from bota_clients.errors import RecordingError
+from bota_clients.identify.last_offset import AtLastOffset
 from bota_clients.identify.program import Motion, choose
 from bota_clients.program import say
+from bota_clients.recording.asked import Asked
 from bota_clients.recording.columns import Floats
-from bota_clients.recording.order import AtLastOffset
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import force_lag_s
 from bota_ethercat.settings import SettingValue
@@ -25,7 +26,7 @@ from bota_ft_compensation.quantities import CompensationError
 
 
 def run(options: argparse.Namespace) -> int:
-    with open_recording(options.path) as recording:
+    with open_recording(options.path, Asked.of(options)) as recording:
         sensor = choose(recording, options.sensor)
         read = AtLastOffset(recording, sensor, options.imu_units)
         motion = Motion()

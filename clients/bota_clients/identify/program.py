@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bota_clients.errors import RecordingError
+from bota_clients.identify.last_offset import AtLastOffset
 from bota_clients.identify.stationary_periods import (
     LEAST_S,
     StationaryPeriod,
@@ -23,9 +24,9 @@ from bota_clients.identify.stationary_periods import (
 )
 from bota_clients.identify.tool_file import write_bota
 from bota_clients.program import say
+from bota_clients.recording.asked import Asked
 from bota_clients.recording.columns import Columns, Floats
-from bota_clients.recording.order import AtLastOffset
-from bota_clients.recording.reader import REWRITTEN, RecordedSensor, Recording, open_recording
+from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
 from bota_ethercat.program.new_file import refuse_existing
 from bota_ft_compensation.alignment import align
@@ -195,12 +196,10 @@ def as_json(
 def run(options: argparse.Namespace) -> int:
     for output in filter(None, (options.yaml, options.bota)):
         refuse_existing(output, force=options.force)
-    with open_recording(options.path) as recording:
+    with open_recording(options.path, Asked.of(options)) as recording:
         sensor = choose(recording, options.sensor)
-        if recording.cut_off is not None:
-            _say(f"{options.path} was cut off ({recording.cut_off}): the intact part is used")
-        if recording.is_rewritten:
-            _say(f"{options.path} {REWRITTEN}")
+        for remark in recording.remarks:
+            _say(f"{options.path} {remark}")
         for row in sensor.history:
             if why := obstacle(row.info.settings, has_tool=True, by_imu=True):
                 raise RecordingError(f"{options.path} does not show a tool: {why}; and record again")

@@ -9,21 +9,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from bota_clients.arguments import add_force, add_server, position, server_of
+from bota_clients.arguments import DURATION_UNIT, add_force, add_server, duration, position, server_of
 from bota_clients.program import Signals, start
 from bota_ethercat.program.arguments import Parser, typed
 from bota_ethercat.program.output import ends_with_its_reader
 from bota_ethercat.program.server_choice import is_address
 
-_UNITS_S: Final = {"": 1, "s": 1, "m": 60, "h": 3600}  # by their first letter
 # Of other formats: a recording so called would be taken for what it is not.
 _OTHERS: Final = {".csv", ".parquet", ".npz", ".npy", ".zarr", ".bag", ".db3", ".json", ".txt", ".hdf5"}
-_UNIT: Final = "s(?:ec(?:ond)?s?)?|m(?:in(?:ute)?s?)?|h(?:(?:ou)?rs?)?"
 
 
 def _duration(text: str) -> float:
-    match = re.fullmatch(rf"([0-9]+(?:\.[0-9]+)?) ?({_UNIT}|)", text, re.ASCII)
-    if match and 1e-9 <= (value := float(match[1]) * _UNITS_S[match[2][:1]]) <= 1e9:
+    if (value := duration(text)) >= 1e-9:
         return value
     raise ValueError
 
@@ -48,7 +45,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
         help="stop when the connection ends, instead of reconnecting")  # fmt: skip
     words = list(sys.argv[1:] if argv is None else argv)
     for at in range(len(words) - 3, -1, -1):  # `--for 5 minutes`
-        if words[at] in ("--for", "--seconds") and re.fullmatch(_UNIT, words[at + 2]):
+        if words[at] in ("--for", "--seconds") and re.fullmatch(DURATION_UNIT, words[at + 2]):
             words[at + 1 : at + 3] = [" ".join(words[at + 1 : at + 3])]
     options = made.parse_args(words)
     name: str = options.name

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -72,6 +72,12 @@ def table_of(parts: Sequence[Rows], sensors: npt.NDArray[Any]) -> Table:
         body = table[row].tobytes()[HEAD:].ljust(length, b"\0")[:length]
         file_format.unpack_frame(body, int(sensors[row]))
     return table
+
+
+def frames_of(table: Table) -> Iterator[DataMessage]:
+    for row in table:
+        body = row.tobytes()[HEAD : RECORD_HEAD + int(row["length"])]
+        yield file_format.unpack_frame(body, int(row["sensor"]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ before the first frame (25 times the time to open), takes a truncated record for
 whatever a zstd frame claims to hold.
 
 - Opening reads record headers, and only those chunks that introduce a channel or have no message index.
+- Messages outside of chunks, as other programs write them, are taken for chunks without compression.
 - An incomplete record at the end of a file without a footer is ignored, and `cut_off` says so.
 - Everything else that is malformed raises RecordingError with its position.
 - Every length is checked against a limit before anything is allocated for it. Every CRC is verified.
@@ -20,7 +21,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Final, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +42,7 @@ MAX_CHUNK: Final = 64 * 1024 * 1024
 MAX_CHUNKS: Final = 2_000_000  # ten days at two a second
 MAX_METADATA: Final = 1024 * 1024  # bytes
 MAX_CHANNELS: Final = 4096
+_BARE: Final = 1024 * 1024  # bytes of messages outside of chunks that are taken for one
 
 _RECORD: Final = struct.Struct("<BQ")
 _CHUNK: Final = struct.Struct("<QQQII")  # times, size and CRC without compression, length of its name
@@ -51,7 +53,7 @@ _SHORT: Final = 256  # bytes: longer ones than a frame
 _INDEX: Final = struct.Struct("<HI")  # channel, bytes that follow: 16 for each message
 # With the trailing magic: the last bytes of a complete file.
 _FOOTER_SIZE: Final = struct.calcsize("<BQQQI8s")
-_UNREADABLE: Final = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
+_UNREADABLE: Final = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError, RuntimeError)
 
 _Counts = tuple[tuple[int, int], ...]
 Rows = npt.NDArray[np.uint8]  # (n, bytes of each)
@@ -116,6 +118,7 @@ class McapFile:
         # hours have a hundred thousand chunks.
         self._chunks, self._counts = array("q"), list[_Counts]()
         self._known: dict[_Counts, _Counts] = {}
+        self._bare: dict[int, int] = {}  # bytes of what is outside of chunks and taken for one
         self._zstd = zstandard.ZstdDecompressor()
         try:
             self._file = path.open("rb", buffering=0)
@@ -203,10 +206,7 @@ class McapFile:
             record = self._parse(Metadata, self._read_at(body, length), body)
             self.notes[record.name] = record.metadata
         elif opcode == Opcode.CHUNK:
-            if len(self._chunks) >= MAX_CHUNKS:
-                raise self._damaged(body, f"it has more than {MAX_CHUNKS} chunks")
-            self._chunks.append(body)
-            self._counts.append(())
+            self._add(body)
         elif opcode == Opcode.MESSAGE_INDEX:
             head = self._read_at(body, min(length, _INDEX.size))
             channel, size = _INDEX.unpack(head) if len(head) == _INDEX.size else (0, -1)
@@ -215,7 +215,19 @@ class McapFile:
             counts = *self._counts[-1], (channel, size // 16)
             self._counts[-1] = self._known.setdefault(counts, counts)
         elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
-            raise RecordingError(f"{self.path} has messages outside of chunks: it is no recording")
+            begin, size = body - _RECORD.size, _RECORD.size + length
+            last = self._bare.get(self._chunks[-1], 0) if self._chunks else 0
+            if last and self._chunks[-1] + last == begin and last + size <= _BARE:
+                self._bare[self._chunks[-1]] = last + size
+            else:
+                self._add(begin)
+                self._bare[begin] = size
+
+    def _add(self, chunk: int) -> None:
+        if len(self._chunks) >= MAX_CHUNKS:
+            raise self._damaged(chunk, f"it has more than {MAX_CHUNKS} chunks")
+        self._chunks.append(chunk)
+        self._counts.append(())
 
     def _index_chunk(self, chunk: int) -> _Counts:
         """Take the channels that a chunk introduces, and count its messages."""
@@ -260,25 +272,31 @@ class McapFile:
 
     def _unpack(self, chunk: int) -> memoryview:
         """The decompressed records of a chunk."""
+        if chunk in self._bare:
+            self._bound(chunk, self._bare[chunk], MAX_CHUNK)
+            return memoryview(self._read_at(chunk, self._bare[chunk]))
         (length,) = _U64.unpack(self._read_at(chunk - _U64.size, _U64.size))
         self._bound(chunk, length, MAX_CHUNK)
-        body = memoryview(self._file.read(length))
+        body: Any = memoryview(self._file.read(length))
         try:  # the library's parser takes half as long as what is decompressed
             _, _, size, crc, named = _CHUNK.unpack_from(body)
-            compression, stored = str(body[_CHUNK.size :][:named], "utf-8"), body[_CHUNK.size + named :]
-            stored = stored[8:][: _U64.unpack_from(stored)[0]]
+            compression, data = str(body[_CHUNK.size :][:named], "utf-8"), body[_CHUNK.size + named :]
+            data = data[8:][: _U64.unpack_from(data)[0]]
         except _UNREADABLE:
             raise self._damaged(chunk, "a Chunk record cannot be read") from None
         self._bound(chunk, size, MAX_CHUNK)
-        if compression not in ("", "zstd"):
-            how = printable(compression, 16)
-            raise RecordingError(
-                f"{self.path} is compressed with {how}, which is not read: write it again with zstd, or none"
-            )
         try:
-            if compression and zstandard.frame_content_size(stored) not in (-1, size):
-                raise ValueError("its sizes differ")
-            data = self._zstd.decompress(stored, size) if compression else stored
+            if compression == "zstd":
+                if zstandard.frame_content_size(data) not in (-1, size):
+                    raise ValueError("its sizes differ")
+                data = self._zstd.decompress(data, size)
+            elif compression == "lz4":
+                from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415 - mcap needs it, and few files
+
+                data = LZ4FrameDecompressor().decompress(data, size + 1)
+            elif compression:
+                how = f"compressed with {printable(compression, 16)}, which is not read"
+                raise RecordingError(f"{self.path} is {how}: write it again with zstd, or none")
             if crc not in (0, zlib.crc32(data)):
                 raise ValueError("its checksum differs")
             if len(data) != size:

@@ -15,7 +15,7 @@ from bota_clients.errors import RecordingError
 from bota_clients.program import Signals, say
 from bota_clients.progress import switch_off
 from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
-from bota_clients.recording.reader import REWRITTEN, Recording, open_recording
+from bota_clients.recording.reader import Recording, open_recording
 from bota_clients.replay.pacing import Pacing
 from bota_clients.replay.sensors import ReplayedSensors, needs_sensor
 from bota_ethercat.control import Event, event
@@ -40,10 +40,8 @@ def run(options: argparse.Namespace, signals: Signals) -> int:
     logging.basicConfig(level=logging.INFO, format="ethercat-replay: %(message)s", stream=sys.stderr)
     try:
         with open_recording(options.path) as recording:
-            if recording.is_rewritten:
-                _say(f"{recording.path} {REWRITTEN}")
-            if recording.cut_off:
-                _say(f"{recording.path} was cut off: {recording.cut_off}; the intact part is played")
+            for remark in recording.remarks:
+                _say(f"{recording.path} {remark}")
             player = Player(recording, options, signals)
             with contextlib.closing(player.hub):
                 player.run()

@@ -8,8 +8,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bota_clients.arguments import add_force, add_imu_units
+from bota_clients.arguments import add_force
 from bota_clients.program import interrupt_on_signals, say, start
+from bota_clients.recording.asked import Asked, add_reading
 from bota_ethercat.health.limits import Level
 from bota_ethercat.program.arguments import Parser
 from bota_ethercat.program.new_file import NewFile
@@ -35,7 +36,7 @@ def parse_options(argv: Sequence[str] | None) -> argparse.Namespace:
     add("-o", "--output", type=Path, metavar="REPORT.html",
         help="where to write the page (default: beside the recording)")  # fmt: skip
     add_force(made)
-    add_imu_units(made)
+    add_reading(made)
     add("--note", default="", metavar="TEXT", help="a remark for the head of the page")
     add("--json", action="store_true", help="print the checks as JSON")
     options = made.parse_args(argv)
@@ -58,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
 
     interrupt_on_signals()
     with NewFile(options.output, force=options.force) as file:
-        found = series.of_recording(options.recording, options.imu_units)
+        found = series.of_recording(options.recording, options.imu_units, Asked.of(options))
         examinations = [checks.Examination(each) for each in found]
         now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
         file.write(page.render(examinations, made=now, program=f"{_PROGRAM} {VERSION}", note=options.note))

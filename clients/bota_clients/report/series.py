@@ -17,8 +17,9 @@ import numpy as np
 
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count, listing, moment
+from bota_clients.recording.asked import Asked
 from bota_clients.recording.columns import Bools, Columns, Floats, Ints
-from bota_clients.recording.reader import REWRITTEN, RecordedSensor, Recording, open_recording
+from bota_clients.recording.reader import ALL, RecordedSensor, Recording, open_recording
 from bota_ethercat.accounting import StreamAccounting
 from bota_ethercat.health.limits import LIMITS
 from bota_ethercat.pdo import ImuUnits
@@ -74,15 +75,15 @@ class Subject:
         return replace(self, remarks=(*self.remarks, *(printable(remark, 300) for remark in remarks)))
 
 
-def of_recording(path: Path, imu_units: ImuUnits) -> list[Subject]:
+def of_recording(path: Path, imu_units: ImuUnits, asked: Asked = ALL) -> list[Subject]:
     """The sensors of the recording at `path`, by position; RecordingError if there is none to be read."""
-    with open_recording(path) as recording:
+    with open_recording(path, asked) as recording:
         recorded = [s for s in recording.sensors if not recording.chosen or s.sensor in recording.chosen]
         if not recorded:
             raise RecordingError(f"{path} has no sensor")
-        remarks = [f"The recording was cut off: {recording.cut_off}."] if recording.cut_off else []
-        if recording.is_rewritten:
-            remarks.append(f"The recording {REWRITTEN}.")
+        remarks = [f"The recording {remark}." for remark in recording.remarks]
+        if asked.part:
+            remarks.append(f"Of the recording only the part {asked.part} was read.")
         if others := [str(sensor.sensor) for sensor in recording.sensors if sensor not in recorded]:
             remarks.append(f"Not recorded, because others were chosen: sensor {listing(others)}.")
         remarks += _event_remarks(event.name for event in recording.events)
@@ -100,8 +101,8 @@ def _event_remarks(names: Iterable[str]) -> list[str]:
 class _Stretch:
     """The frames of a sensor between two changes of settings or sensor; to be read several times."""
 
-    def __init__(self, path: Path, sensor: RecordedSensor, imu_units: ImuUnits) -> None:
-        self._path, self._sensor, self._units = path, sensor, imu_units
+    def __init__(self, recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits) -> None:
+        self._of, self._sensor, self._units = (recording.path, recording.asked), sensor, imu_units
         self._number: int | None = None  # of those of the recording; None: it is all of it
         self.info, self.lost_because = sensor.info, ""  # what the server said when it lost the sensor last
         self._last = self._until_ns = _MAX  # frames after this one and after this time give nothing
@@ -109,7 +110,7 @@ class _Stretch:
     def _batches(self) -> Iterator[tuple[int, InForce, Columns]]:
         """With the number of their stretch; the order in the file decides, because clocks differ."""
         number, was = 0, self._sensor.info
-        with open_recording(self._path) as recording:
+        with open_recording(*self._of) as recording:
             for in_force, part in recording.batches(self._sensor.sensor, self._units):
                 info = in_force.info
                 number += (was.identity, was.settings) != (info.identity, info.settings)
@@ -145,7 +146,7 @@ class _Stretch:
 
 def _subject(recording: Recording, sensor: RecordedSensor, imu_units: ImuUnits) -> Subject:
     """Its longest stretch without a change of settings or sensor."""
-    parts = _Stretch(recording.path, sensor, imu_units)
+    parts = _Stretch(recording, sensor, imu_units)
     if len(sensor.history) > 1 or any(each.in_force.lost for each in sensor.changes):
         parts.choose_longest()
     remarks = [] if parts.info.settings else ["The settings are not known."]

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, Final, TypeVar
 
 from bota_ethercat import option_types
+from bota_ethercat.errors import SettingError
 from bota_ethercat.option_types import OptionType
 from bota_ethercat.program.command import command
 from bota_ethercat.program.version import VERSION
@@ -67,12 +68,12 @@ class Parser(argparse.ArgumentParser):
 
 
 def typed(convert: Callable[[str], _Value], what: str = "") -> Callable[[str], _Value]:
-    """The type of an argument; for a ValueError argparse says `what` it must be, or else the error."""
+    """The type of an argument; for an error argparse says `what` it must be, or else itself."""
 
     def converted(text: str) -> _Value:
         try:
             return convert(text)
-        except ValueError as error:
+        except (ValueError, SettingError) as error:
             raise argparse.ArgumentTypeError(f"{text!r}: it must be {what}" if what else str(error)) from None
 
     return converted

@@ -23,7 +23,7 @@ from bota_ethercat_bridge.publishing.contact import ContactTopic
 from bota_ethercat_bridge.publishing.messages import Stamps, decoder
 from bota_ethercat_bridge.publishing.wrenches import FilteredTopic, TfFrames, WrenchTopic, make_frames
 from bota_ethercat_bridge.stream.link import NodeClock
-from bota_ft_compensation.imu import Source
+from bota_ft_compensation.imu import GravityCheck, Source
 from bota_ft_compensation.quantities import ZERO, CompensationError
 from bota_ft_compensation.stationary import StationaryWindow, triple
 from bota_ft_compensation.stream import CompensatedStream
@@ -62,8 +62,8 @@ class Compensation:
         published, withheld: samples since the node started that were compensated, and that were not.
         why_withheld: of the latest of these; empty: the source knew nothing.
         is_stopped: whether the latest sample could not be compensated.
-        sample, felt, time_s, stamp_s: the latest, its specific force, its time by the server's monotonic
-            clock and since 1970.
+        gravity: whether it looks right.
+        sample, time_s, stamp_s: the latest, its time by the server's monotonic clock and since 1970.
     """
 
     parts = (WRENCH,)
@@ -101,8 +101,8 @@ class Compensation:
         self.published = self.withheld = 0
         self.why_withheld = ""
         self.decode = decoder(parameters).sample
+        self.gravity = GravityCheck()
         self.sample: Sample | None = None
-        self.felt: Vector3 | None = None  # by it
         self.time_s = self.stamp_s = 0.0
         self.configure(parameters)
 
@@ -129,8 +129,10 @@ class Compensation:
         self.time_s, self.stamp_s = time_s, stamp_s
         window, stream = self.window, self.stream
         if window is None or window.done.is_set():
-            self.felt = stream.feel(sample, time_s, stamp_s)
-            return self.felt
+            felt, gravity = stream.feel(sample, time_s, stamp_s), self.gravity
+            if not 0.0 < gravity.due_s - time_s < 1.0 and stream.plan.has_tool:
+                gravity.look(sample, felt, time_s, by_imu=stream.plan.source.is_imu)
+            return felt
         felt = stream.feel(sample, time_s, stamp_s, always=True)
         window.observe(sample, time_s, stamp_s, felt)
         return felt if stream.plan.has_tool else ZERO

@@ -68,7 +68,7 @@ class CompensationControl:
         self.reader, self.link, self._live = reader, reader.link, live
         self.origin = _FROM_PARAMETER  # where the bias in force comes from
         self._node, self._log, self._setting = node, node.get_logger(), node.setting
-        self.source, self._gravity = Source(), GravityCheck()
+        self.source, self._told = Source(), ""
         self._source_of: object = None  # what the open source depends on
         self._group = MutuallyExclusiveCallbackGroup()
         # Of the sensor that the bias in force is for; "": none was there yet.
@@ -92,7 +92,7 @@ class CompensationControl:
 
     def _close_source(self) -> None:
         self.source.close()
-        self.source, self._source_of, self._gravity = Source(), None, GravityCheck()
+        self.source, self._source_of, self.output.gravity = Source(), None, GravityCheck()
 
     def link_changed(self) -> None:
         """What is in force, or the connection, has changed; for the reader's thread."""
@@ -134,19 +134,16 @@ class CompensationControl:
         parts = ["bias"] if bias != NO_WRENCH else []
         if payload.mass:
             parts.append("weight and inertia of the tool" if source.is_imu else "weight of the tool")
-        if payload.mass and output.sample is not None:
-            before = self._gravity.problem
-            self._gravity.look(output.sample, output.felt, output.time_s, by_imu=source.is_imu)
-            if self._gravity.problem not in ("", before):
-                self._log.warning(f"wrench_compensated is wrong: {self._gravity.problem}")
+        before, self._told = self._told, output.gravity.problem if payload.mass else ""
+        if self._told not in ("", before):
+            self._log.warning(f"wrench_compensated is wrong: {self._told}")
         none = "nothing is subtracted: there is no bias and no tool_mass"
         good = f"subtracted: {', '.join(parts)}" if parts else none
         return CompensationState(
             good if has_subscribers else f"{good}; nobody has subscribed",
             self._values,
             stopped=self._why_stopped() or output.problem,
-            doubtful=self._ramp.taken.doubt(payload)
-            or (self._gravity.problem if payload.mass and has_subscribers else ""),
+            doubtful=self._ramp.taken.doubt(payload) or (self._told if has_subscribers else ""),
             follows_imu=source.is_imu and payload.mass > 0.0,
             withheld=output.withheld,
             why_withheld=output.why_withheld or f"{_NOTHING_CURRENT} ({source.name})",

@@ -269,7 +269,9 @@ class _Equations:
         self, found: Estimate, kept: NDArray[np.bool_], regressor: Array | None
     ) -> tuple[Estimate, Array | None]:
         """The answer if axes vary by the windows' noise, (6,), which it is too; or what was `found`, None."""
-        directions = float(found.mass.value[0]) ** 2 * self._noise * (self._acceleration is not None)
+        # Noise of what is read is the same in force and torque, which count as two measurements of it, as is
+        # right where one of them tells nothing; where both tell the same its variance is twice as large.
+        directions = 1.5 * float(found.mass.value[0]) ** 2 * self._noise * (self._acceleration is not None)
         arms = np.concatenate([np.ones(3), ((found.center.value**2).sum() - found.center.value**2) / 2])
         expected = (self.spread**2 / self._samples).mean(axis=0) + directions * arms
         if not self.spread.all():
