@@ -96,7 +96,6 @@ PACKAGES: Final[dict[str, set[str]]] = {
     "pysoem": {f"{S}.ethercat.soem"},
     "pyroute2": {S},
     "numpy": {B, C, "bota_clients"},
-    "matplotlib": {"bota_clients.report"},
     "mcap": {"bota_clients.recording", "bota_clients.export.ros_topics"},
     "zstandard": {"bota_clients.recording"},
     "lz4": {"bota_clients.recording"},

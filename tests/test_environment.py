@@ -179,9 +179,9 @@ def test_the_demo_needs_no_tools_of_developers() -> None:
 @needs_bus
 @pytest.mark.bus
 def test_the_demo_without_ros_ends_with_what_the_monitor_knows_and_leaves_nothing(tmp_path: Path) -> None:
-    """Where matplotlib, numpy and rclpy cannot be imported."""
+    """Where numpy and rclpy cannot be imported."""
     blocked = tmp_path / "blocked"
-    for name in ("matplotlib", "numpy", "rclpy"):
+    for name in ("numpy", "rclpy"):
         (blocked / name).mkdir(parents=True)
         (blocked / name / "__init__.py").write_text("raise ImportError(__name__)")
     own = tmp_path / "own"

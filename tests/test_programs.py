@@ -36,7 +36,7 @@ SCRIPTS: Final[dict[str, str]] = tomllib.loads((ROOT / "pyproject.toml").read_te
 PROGRAMS: Final = {name: entry for name, entry in SCRIPTS.items() if not name.startswith("bridge-")}
 CLIENTS: Final = [name for name, entry in PROGRAMS.items() if entry.startswith("bota_clients.")]
 PATHS: Final = os.pathsep.join(str(ROOT / folder) for folder in (".", "protocol", "clients"))
-EXTRA: Final = ("jinja2", "matplotlib", "mcap", "numpy", "rich", "textual", "zstandard")
+EXTRA: Final = ("jinja2", "mcap", "numpy", "rich", "textual", "zstandard")
 
 INTERRUPTED: Final = """
 import os, sys

@@ -116,6 +116,16 @@ class ImuSource(Source):
         self.felt = found
         return found
 
+    def follow_all(self, acceleration: Array, angular_rate: Array, times: Array) -> tuple[Array, Array]:
+        """As `follow`, of samples (n, 3) at `times` (n,): (3, n), NaN for None, and `turning` (2, 3, n)."""
+        felt, turned = self._imu.follow_all(np.hstack([acceleration, angular_rate]), times)
+        self.turning = self._imu.turning
+        felt[:, ~acceleration.any(axis=1)] = math.nan
+        for at in np.flatnonzero(np.isfinite(felt[0]))[-1:]:
+            x, y, z = felt[:, at].tolist()
+            self.felt = x, y, z
+        return felt, turned
+
     def why_none(self, sample: Sample, stamp_s: float) -> str:  # noqa: ARG002
         if not any(sample.acceleration):
             return IMU_IS_OFF

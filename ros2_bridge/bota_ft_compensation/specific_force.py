@@ -15,9 +15,10 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from bota_ethercat.pdo import Vector3
 from bota_ft_compensation.alignment import Alignment, Array, align
@@ -31,6 +32,7 @@ from bota_ft_compensation.quantities import (
     Accelerometer,
     Matrix,
     Quaternion,
+    Turning,
 )
 
 _TURNING: Final = 0.05  # rad/s: less is a gyroscope's offset
@@ -104,17 +106,52 @@ class ImuSpecificForce:
         if self._filled < lead and (dx or dy or dz) and (self._moved or _turns(angular_rate)):
             return None
         found = self.alignment.taps.dot(self._rows[self._end - self._size : self._end])
-        (ax, ay, az, _, _, _), (_, _, _, wx, wy, wz), (_, _, _, tx, ty, tz) = found.dot(
-            self._corrected
-        ).tolist()
-        bx, by, bz = self._base
-        self.turning = (wx, wy, wz), (tx, ty, tz)
+        felt, self.turning = self._at_center(found.dot(self._corrected).tolist())
+        return felt
+
+    def follow_all(self, rows: Array, times: Array) -> tuple[Array, Array]:
+        """As `follow` of each, to the bit: (3, n), NaN for None, and every `turning` (2, 3, n).
+
+        Of `rows` (n, 6), m/s² and rad/s, those that follow one another without a gap are taken at once.
+        """
+        count, size, begin = len(rows), self._size, 0
+        felt, turned = np.empty((3, count)), np.empty((2, 3, count))
+        good = np.asarray(np.isfinite(rows).all(axis=1))
+        passed_s = np.diff(times, prepend=self._time_s)
+        most_s = min(self.alignment.gap_s, 1.5 * self.alignment.period_s)
+        good &= np.append(True, good[:-1]) & (passed_s > 0.0) & (passed_s <= most_s)
+        breaks = np.append(np.flatnonzero(~good), count)
+        ends = breaks[np.searchsorted(breaks, np.arange(count))].tolist()
+        while begin < count:
+            if not good[begin] or self._filled < self.alignment.lead:
+                ax, ay, az, wx, wy, wz = rows[begin].tolist()
+                now = self.follow((ax, ay, az), (wx, wy, wz), times[begin].item())
+                felt[:, begin], turned[:, :, begin], begin = now or math.nan, self.turning, begin + 1
+                continue
+            end = ends[begin]
+            held = np.concatenate([self._rows[self._end - size + 1 : self._end], rows[begin:end]])
+            # Multiplied one by one: the sums of a larger product would be in another order.
+            found = self.alignment.taps @ sliding_window_view(held, size, axis=0).swapaxes(1, 2)
+            part, begin = slice(begin, end), end
+            felt[:, part], turned[:, :, part] = self._at_center(np.moveaxis(found @ self._corrected, 0, 2))
+            self._rows[:size] = held[-size:]
+            self._end, self._filled = size, self._filled + len(found)
+            self._time_s = times[end - 1].item()
+            (wx, wy, wz), (tx, ty, tz) = turned[:, :, end - 1].tolist()
+            self.turning = (wx, wy, wz), (tx, ty, tz)
+        return felt, turned
+
+    def _at_center(self, aligned: Any) -> tuple[Vector3, Turning]:
+        """Specific force and turning, by readings (3, 6) of a sample, or of many."""
+        (ax, ay, az, _, _, _), (_, _, _, wx, wy, wz), (_, _, _, tx, ty, tz) = aligned
+        (bx, by, bz), (dx, dy, dz) = self._base, self.lever
         vx, vy, vz = wy * dz - wz * dy, wz * dx - wx * dz, wx * dy - wy * dx
-        return (
+        felt = (
             ax + bx + ty * dz - tz * dy + wy * vz - wz * vy,
             ay + by + tz * dx - tx * dz + wz * vx - wx * vz,
             az + bz + tx * dy - ty * dx + wx * vy - wy * vx,
         )
+        return felt, ((wx, wy, wz), (tx, ty, tz))
 
     def _bridge(self, row: Row, passed_s: float) -> None:
         """The samples that were lost before one that comes so long after the one before."""

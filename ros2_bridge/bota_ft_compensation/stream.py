@@ -49,7 +49,6 @@ from bota_ft_compensation.quantities import (
 )
 
 Settings = Mapping[str, SettingValue]
-_UNKNOWN: Final = (math.nan,) * 3
 _ROUNDING_S: Final = 1e-6
 _BEING_CHANGED: Final = "the sensor's own offset was being changed"
 _BY_IMU: Final = (FORCE_TORQUE, ACCELERATION, ANGULAR_RATE)  # what weight and inertia by the IMU need
@@ -195,24 +194,19 @@ class CompensatedStream:
         """
         source, times = self.plan.source, samples.monotonic_ns * 1e-9
         assert isinstance(source, ImuSource)
-        felt, turning = np.zeros((len(times), 3)), cast(Any, STILL)
+        felt, turning = np.zeros((3, len(times))), cast(Any, STILL)
         if self.plan.has_tool:
             if source.in_force is not self.in_force:
                 source.configure(self.in_force)
-            rows, turned = list[Vector3](), list[Turning]()
-            each = (column.tolist() for column in (samples.acceleration, samples.angular_rate, times))
-            for acceleration, rate, time_s in zip(*each, strict=True):
-                rows.append(source.follow(acceleration, rate, time_s) or _UNKNOWN)
-                turned.append(source.turning)
-            felt, turning = np.array(rows).reshape(-1, 3), np.moveaxis(np.array(turned), 0, 2)
+            felt, turning = source.follow_all(samples.acceleration, samples.angular_rate, times)
         columns = SimpleNamespace(force=samples.force.T, torque=samples.torque.T)
-        found = np.vstack(self.stages(columns, math.inf, cast(Any, felt.T), turning).final).T
+        found = np.vstack(self.stages(columns, math.inf, cast(Any, felt), turning).final).T
         flagged = sum(channel.flagged(samples) for channel in self._needed)
         found[(times <= self._doubted_until_s) | (flagged != 0)] = math.nan
         if self.hold:
             found[:] = math.nan
         self._newest_s = times[-1] if len(times) else self._newest_s
-        return found, np.column_stack(np.broadcast_arrays(*self.bounds(felt.T, turning), times)[:2])
+        return found, np.column_stack(np.broadcast_arrays(*self.bounds(felt, turning), times)[:2])
 
     def bounds(self, felt: Any = None, turning: Any = None) -> tuple[Any, Any]:
         """95 % bounds of the error of a sample's force, N, and torque, Nm; without contact.

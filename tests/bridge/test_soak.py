@@ -155,8 +155,12 @@ def recorder_records(folder: Path) -> Soaked:
         while recorder.saved < written:
             time.sleep(0)
 
-    ours = [each for name, each in vars(recorder).items() if name not in ("_writer", "_thread")]
-    return fed(take, *ours)
+    writer = recorder._writer
+    kept = vars(recorder) | vars(writer) | vars(writer._mcap)
+    index = kept["_Writer__chunk_indices"]
+    return fed(
+        take, *(each for each in kept.values() if each not in (writer, writer._mcap, index, recorder._thread))
+    )
 
 
 def replay_repeats(_: Path) -> Soaked:

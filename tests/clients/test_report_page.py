@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -77,7 +79,7 @@ def test_it_is_one_file_with_nothing_outside_it(page: str) -> None:
         for name, value in attributes.items():
             assert not name.startswith("on")
             if name in {"href", "src", "style"}:
-                assert re.match("#|data:image/png;base64,", str(value)), "loads from elsewhere"
+                assert re.match(r"#|data:image/svg\+xml;base64,", str(value)), "loads from elsewhere"
     [policy] = [tag for tag in reader.of("meta") if "http-equiv" in tag]
     assert "default-src 'none'" in str(policy["content"])
     assert "@import" not in page
@@ -91,6 +93,10 @@ def test_it_can_be_read_without_seeing_it(page: str) -> None:
     descriptions = [str(plot["alt"]) for plot in reader.of("img")]
     assert len(descriptions) == 5
     assert all(re.search(r"\d", words) for words in descriptions), "they say what is in the plot"
+    for plot in reader.of("img"):
+        drawn = base64.b64decode(str(plot["src"]).partition(",")[2]).decode()
+        assert len(ElementTree.fromstring(drawn).findall("{*}path")) > 3
+        assert not re.search("nan|inf", drawn)
     assert len(reader.of("th")) == len([tag for tag in reader.of("th") if tag.get("scope")])
     assert reader.of("html") == [{"lang": "en"}]
     headings = [tag for tag, _ in reader.tags if re.fullmatch("h[1-6]", tag)]
@@ -137,7 +143,7 @@ def test_what_a_device_says_is_text_and_nothing_else(two: tuple[str, str]) -> No
     page, as_text = two
     reader = Reader(page)
     assert not reader.of("script")
-    assert all(str(each["src"]).startswith("data:image/png;base64,") for each in reader.of("img"))
+    assert all(str(each["src"]).startswith("data:image/svg+xml;base64,") for each in reader.of("img"))
     assert "<script" not in page
     assert "alert(1)" in "".join(reader.words), "shown as it is"
     assert not {"\u202e", "\x07"} & set(page)

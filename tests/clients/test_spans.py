@@ -13,10 +13,13 @@ from typing import Any, Final
 import numpy as np
 import pytest
 
+from bota_clients.export import dataset
 from bota_clients.export.cli import main as export
 from bota_clients.identify.cli import main as identify
 from bota_clients.recording.columns import columns
 from bota_clients.recording.order import TimeAxis, longest_order
+from bota_clients.recording.reader import open_recording
+from bota_clients.recording.writer import DiskFile, RecordingWriter
 from bota_clients.report.checks import Examination
 from bota_clients.report.cli import main as report
 from bota_clients.report.series import of_recording
@@ -26,6 +29,7 @@ from bota_ethercat.replies import SensorInfo
 from bota_ethercat.settings import start_up_defaults
 from bota_ethercat.stream.timeline import InForce
 from bota_ft_compensation.quantities import Payload
+from tests.bridge.test_soak import size
 from tests.clients.bags import imu, write_bag
 from tests.clients.recordings import START_NS, describe, frame, write
 from tests.clients.test_identify import felt_frames
@@ -217,9 +221,18 @@ def examine(path: Path) -> None:
         Examination(subject)
 
 
-@pytest.mark.parametrize("program", [examine, lambda path: run_here(identify, path, "--json")])
-def test_memory_does_not_grow_with_the_length(tmp_path: Path, program: Callable[[Path], object]) -> None:
+@pytest.mark.parametrize("program", [
+    examine,
+    lambda path: run_here(identify, path, "--json"),
+    lambda path: run_here(identify, "delay", path, "--json"),
+    lambda path: run_here(export, path, path.with_suffix(".npz"), "--force"),
+    lambda path: run_here(export, path, "--mcap", path.with_suffix(".whole.mcap"), "--force"),
+])  # fmt: skip
+def test_memory_does_not_grow_with_the_length(
+    tmp_path: Path, program: Callable[[Path], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
     peaks, path = [], tmp_path / "run.mcap"
+    monkeypatch.setattr(dataset, "_GROUP", 4096)
     for seconds in (200, 800):
         row = describe(0, **SETTINGS)
         row["sensors"][0]["rate_hz"] = RATE_HZ
@@ -230,6 +243,24 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path, program: Callable[
         tracemalloc.stop()
     # More by buffers that were not full; the samples would take 30 MB.
     assert peaks[1] < max(1.1 * peaks[0], peaks[0] + (4 << 20))
+
+
+def test_of_a_chunk_little_is_kept_by_who_writes_it_and_who_reads_it(tmp_path: Path) -> None:
+    """Two and a half come every second."""
+    kept = []
+    for count in (200, 1200):
+        path = tmp_path / f"{count}.mcap"
+        writer = RecordingWriter(DiskFile(path, overwrite=False), "test", {})
+        for each in again(count):
+            writer.frame(each)
+            writer.flush()
+        written = size(writer)
+        writer.finish({})
+        with open_recording(path) as recording:
+            kept.append((written, size(recording)))
+    (written, read), (more_written, more_read) = kept
+    assert more_written - written < 1000 * 150
+    assert more_read - read < 1000 * 30
 
 
 @pytest.mark.parametrize(

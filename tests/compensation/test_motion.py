@@ -15,11 +15,14 @@ import numpy as np
 import pytest
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
+from bota_ethercat.replies import SensorInfo
 from bota_ethercat.sensor.response import imu_noise
+from bota_ethercat.stream.timeline import InForce
 from bota_ft_compensation.alignment import Alignment, Array, align
 from bota_ft_compensation.bias import TareBasis, estimate_bias
 from bota_ft_compensation.bounds import Bounds
 from bota_ft_compensation.compensator import Compensator
+from bota_ft_compensation.imu import ImuSource
 from bota_ft_compensation.quantities import (
     DEFAULT_GRAVITY,
     EXACT,
@@ -267,6 +270,30 @@ def test_the_specific_force_is_that_of_the_aligned_samples_also_around_gaps(seed
             assert [*got, *found.turning[0], *found.turning[1]] == pytest.approx(wanted, abs=1e-8)
         withheld += got is None and bool(np.isfinite(sent).all())
     assert (withheld > 5) is any(lever)
+
+
+def test_many_samples_are_taken_as_one_by_one_to_the_bit() -> None:
+    """With gaps, clocks that go back, values that are none, and an accelerometer that is off."""
+    draw, count = np.random.default_rng(SEED), 4000
+    times = np.cumsum(draw.choice([1.0, 2.0, 6.0, 40.0, -3.0], count, p=[0.97, 0.01, 0.01, 0.005, 0.005]))
+    rows = draw.normal(size=(count, 6))
+    rows[:1000, 3:] *= 0.001
+    rows[draw.random(count) < 0.003, 4] = math.nan
+    rows[draw.random(count) < 0.003, :3] = 0.0
+    for chosen in (settings(), settings(512, fir=True)):
+        known = Accelerometer((0.1, 0.0, -0.2), (1.01, 0.99, 1.0))
+        one, many = (ImuSource((0.01, -0.02, 0.1), accelerometer=known) for _ in range(2))
+        for source in (one, many):
+            source.configure(InForce(SensorInfo(0, rate_hz=RATE_HZ, settings=chosen)))
+        begin = 0
+        while begin < count:
+            part = slice(begin, begin := min(begin + int(draw.integers(1, 300)), count))
+            felt, turned = many.follow_all(rows[part, :3], rows[part, 3:], times[part] / RATE_HZ)
+            for row, time_s, *found in zip(rows[part], times[part] / RATE_HZ, felt.T, turned.T, strict=True):
+                expected = one.follow(triple(row[:3]), triple(row[3:]), float(time_s))
+                assert found[0].tolist() == [*expected] if expected else np.isnan(found[0]).all()
+                assert tuple(map(tuple, found[1].T.tolist())) == one.turning
+            assert (many.felt, many.turning) == (one.felt, one.turning)
 
 
 # -- tare and bound

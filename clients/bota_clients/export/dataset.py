@@ -21,6 +21,8 @@ import math
 import os
 import shutil
 import tempfile
+import zipfile
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
@@ -31,7 +33,7 @@ import numpy as np
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import DATASETS, PROGRAM
 from bota_clients.export.samples import MOST_LOST, in_part, samples_of
-from bota_clients.export.windows import Array, Arrays, Windows, interpolated, read_tool
+from bota_clients.export.windows import Arrays, Windows, interpolated, read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.columns import REGISTERS, Ints
@@ -58,9 +60,7 @@ _FIRST: Final = -(1 << 63)
 _COARSEST_S: Final = 0.001
 _DAY_NS: Final = 10**14  # after 1970: earlier times count from the start of something
 _NEAR_NS: Final = 366 * 86400 * _SECOND
-MOST_LEFT_OUT: Final = (
-    0.1  # of rows or messages, because of their order: with more it is the stamps that are wrong
-)
+MOST_LEFT_OUT: Final = 0.1  # of rows or messages, for their order: with more it is the stamps that are wrong
 
 
 class ForeignClock(NamedTuple):
@@ -177,20 +177,27 @@ class Stamped:
         """What is not later than the row before, unless the clock was set back, or it is much."""
         kept = in_order(self._stamps)
         if self._clock is None and not kept.all():
-            batches = TimeAxis().batches(recording.batches(sensor, is_whole=True))
-            new = [np.stack([each.stamp_ns, each.monotonic_ns])[:, each.fresh] for _, each in batches]
-            kept = longest_order(self._places(*np.hstack([np.zeros((2, 0), np.int64), *new])))
+            clocks, steps = np.zeros((2, 0), np.int64), list[Ints]()
+            for _, each in TimeAxis().batches(recording.batches(sensor, is_whole=True)):
+                new = np.stack([each.stamp_ns, each.monotonic_ns])[:, each.fresh]
+                clocks = np.hstack([clocks[:, -1:], new])
+                last = np.flatnonzero(np.diff(clocks[0]) < 0)  # before each step back
+                steps.append(np.stack([clocks[:, last], clocks[:, last + 1]]))
+            before, after = np.concatenate([np.zeros((2, 2, 0), np.int64), *steps], axis=2)
+            kept = longest_order(self._places(before, after))
         if (~kept).mean() <= MOST_LEFT_OUT:
             self.left_out = int((~kept).sum())
             self._rows, self._stamps, self._left = self._rows[kept], self._stamps[kept], self._left[kept]
             self.count -= self.left_out
 
-    def _places(self, stamps: Ints, instants: Ints) -> Iterator[list[int]]:
-        """Of each row the stretches without a step back that it may be of, by the samples' clocks; and it."""
-        last = np.flatnonzero(np.diff(stamps) < 0)  # before each step back
-        apart = instants[last + 1] - instants[last]
-        first = [-math.inf, *(stamps[last + 1] - apart).tolist()]
-        ends = [*(stamps[last] + apart).tolist(), math.inf]
+    def _places(self, before: Ints, after: Ints) -> Iterator[list[int]]:
+        """Of each row the stretches without a step back that it may be of, and it.
+
+        By the samples' clocks (2, k), stamps and instants, before and after each of the k steps.
+        """
+        apart = after[1] - before[1]
+        first = [-math.inf, *(after[0] - apart).tolist()]
+        ends = [*(before[0] + apart).tolist(), math.inf]
         for row in self._stamps.tolist():
             within = enumerate(zip(first, ends, strict=True))
             yield [(number << 64) + row for number, (begin, end) in within if begin <= row <= end]
@@ -456,22 +463,21 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     with tempfile.TemporaryDirectory(
         prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
     ) as folder:
-        made, valid = Path(folder, path.name), list[Array]()
+        made, tally = Path(folder, path.name), Counter[bool]()
         if frames:
             blocks = windows_of(recording, frames, windows, sensor.sensor, axis)
         else:
             blocks = samples_of(recording, windows, sensor.sensor, axis)
         blocks = in_chunks(in_part(recording, windows, blocks), _CHUNK if frames else _GROUP)
         if not frames:
-            blocks = _tallied(blocks, valid)
+            blocks = _tallied(blocks, tally)
         _WRITERS[options.suffix](made, said, blocks)
         if path.is_dir():
             shutil.rmtree(path)
         made.replace(path)
     remarks = axis.said
     if not frames:
-        rows = np.concatenate(valid)
-        remarks.insert(0, f"{count(len(rows), 'sample')}, {len(rows) - rows.sum()} of them not valid")
+        remarks.insert(0, f"{count(tally.total(), 'sample')}, {tally[False]} of them not valid")
         return "; ".join(remarks)
     if isinstance(frames, Stamped) and frames.outside:
         remarks.append(
@@ -512,10 +518,11 @@ def about(
     }  # fmt: skip
 
 
-def _tallied(blocks: Iterable[Arrays], valid: list[Array]) -> Iterator[Arrays]:
-    """The same, and which of the rows are valid."""
+def _tallied(blocks: Iterable[Arrays], tally: Counter[bool]) -> Iterator[Arrays]:
+    """The same; counted is which of the rows are valid."""
     for block in blocks:
-        valid.append(block["valid"])
+        valid = int(block["valid"].sum())
+        tally.update({True: valid, False: len(block["valid"]) - valid})
         yield block
 
 
@@ -595,9 +602,23 @@ def parquet_writer(path: Path, schema: Any, more: Mapping[str, str] = {}) -> Any
 
 
 def _npz(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
-    """An array for each name, and `attributes`, text."""
-    arrays: dict[str, Any] = _as_one(list(blocks))
-    np.savez(path, attributes=np.array(about), **arrays)
+    """An array for each name, and `attributes`, text; in memory is a block."""
+    rows, block = 0, Arrays()
+    with contextlib.ExitStack() as stack, zipfile.ZipFile(path, "w") as made:
+        parts = defaultdict[str, Any](lambda: stack.enter_context(tempfile.TemporaryFile(dir=path.parent)))
+        for block in blocks:
+            rows += len(block["monotonic_ns"])
+            for name, array in block.items():
+                parts[name].write(array.tobytes())
+        with made.open("attributes.npy", "w") as member:
+            np.lib.format.write_array(member, np.array(about))
+        for name, array in block.items():
+            head = np.lib.format.header_data_from_array_1_0(array)
+            head |= {"fortran_order": False, "shape": (rows, *array.shape[1:])}
+            with made.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array_header_1_0(member, head)
+                parts[name].seek(0)
+                shutil.copyfileobj(parts[name], member)
 
 
 def _zarr(path: Path, about: str, blocks: Iterable[Arrays]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import collections
 import json
 import sys
 from collections.abc import Mapping
@@ -12,10 +13,10 @@ import numpy as np
 
 from bota_clients.errors import RecordingError
 from bota_clients.identify.last_offset import AtLastOffset
-from bota_clients.identify.program import choose
+from bota_clients.identify.program import Motion, choose
 from bota_clients.program import say
 from bota_clients.recording.asked import Asked
-from bota_clients.recording.columns import Columns, joined
+from bota_clients.recording.columns import Floats
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import force_lag_s
 from bota_ethercat.settings import SettingValue
@@ -28,14 +29,15 @@ def run(options: argparse.Namespace) -> int:
     with open_recording(options.path, Asked.of(options)) as recording:
         sensor = choose(recording, options.sensor)
         read = AtLastOffset(recording, sensor, options.imu_units)
-        data = joined([*read])
+        motion = Motion()
+        collections.deque(motion.passing(read), maxlen=0)
     for remark in read.said:
         say("ethercat-identify", f"{options.path}: {remark}")
     if any(row.info.settings != sensor.info.settings for row in sensor.history):
         raise RecordingError(f"{options.path}: settings were changed during it: record without that")
     settings, found, error, left = sensor.info.settings, None, "", (0.0, 0.0)
     try:
-        found, left = _find(data, settings)
+        found, left = _find(*motion.rows(), settings)
     except CompensationError as refusal:
         error = str(refusal)
     expected_s = force_lag_s(settings, sensor.info.rate_hz or None)
@@ -61,12 +63,9 @@ def run(options: argparse.Namespace) -> int:
     return int(found is None)
 
 
-def _find(data: Columns, settings: Mapping[str, SettingValue]) -> tuple[Lag, tuple[float, float]]:
-    data = data.where(data.fresh)
-    samples = np.concatenate([data.force, data.acceleration, data.angular_rate], axis=1)
-    usable = np.isfinite(samples).all(axis=1)
-    times = (data.monotonic_ns - data.monotonic_ns[:1])[usable] * 1e-9
-    samples = samples[usable]
-    force, acceleration, rate = np.split(samples, 3, axis=1)
+def _find(
+    times: Floats, rows: Floats, settings: Mapping[str, SettingValue]
+) -> tuple[Lag, tuple[float, float]]:
+    force, _, acceleration, rate = np.split(rows, 4, axis=1)
     lag = find_lag(times, force, acceleration, rate, gyroscope_later_s(settings))
-    return lag, check_held_out(times, samples, settings, lag)
+    return lag, check_held_out(times, np.hstack([force, acceleration, rate]), settings, lag)

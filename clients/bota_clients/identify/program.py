@@ -55,7 +55,7 @@ Poses = Sequence[tuple[StationaryPeriod, Pose]]
 _say = partial(say, "ethercat-identify")
 
 
-class _Motion:
+class Motion:
     """The usable samples of a recording, of a long one those parts in which the sensor turned the most."""
 
     def __init__(self) -> None:
@@ -204,7 +204,7 @@ def run(options: argparse.Namespace) -> int:
             if why := obstacle(row.info.settings, has_tool=True, by_imu=True):
                 raise RecordingError(f"{options.path} does not show a tool: {why}; and record again")
         read = AtLastOffset(recording, sensor, options.imu_units)
-        motion, offset = _Motion(), read.offset
+        motion, offset = Motion(), read.offset
         periods, rejected = find_stationary_periods(motion.passing(read))
     for remark in read.said:
         _say(f"{options.path}: {remark}")
@@ -266,7 +266,7 @@ def _write_files(
             )
 
 
-def _in_motion(motion: _Motion, sensor: RecordedSensor, poses: Identified | None) -> Identified:
+def _in_motion(motion: Motion, sensor: RecordedSensor, poses: Identified | None) -> Identified:
     """By what the recording has of motion, beside poses or alone; CompensationError."""
     return identify_in_motion(_turned(motion, sensor), _imu(sensor), poses)
 
@@ -275,7 +275,7 @@ def _imu(sensor: RecordedSensor) -> Vector3:
     return imu_position(sensor.info.name)
 
 
-def _turned(motion: _Motion, sensor: RecordedSensor) -> Turned:
+def _turned(motion: Motion, sensor: RecordedSensor) -> Turned:
     if any(row.info.settings != sensor.info.settings for row in sensor.history):
         raise CompensationError("settings were changed during the recording")
     times, rows = motion.rows()

@@ -67,10 +67,7 @@ class _Finder:
     def __init__(self, least_seconds: float) -> None:
         self.periods, self.rejected = list[StationaryPeriod](), list[str]()
         self._least_s, self._begin_ns = least_seconds, -1
-        self._rest, self._held = (
-            np.zeros((0, 14)),
-            list[Floats](),
-        )  # of no whole block yet; blocks of the period
+        self._rest, self._held = np.zeros((0, 14)), list[Floats]()  # of no whole block yet; of the period
         self._size = 0  # samples in a block; 0: to be told by the first ones of the stretch
         self._last_s = -math.inf
 
@@ -103,10 +100,8 @@ class _Finder:
             period = float(rest[-1, _TIME] - rest[0, _TIME]) / (len(rest) - 1)
             self._size = max(_BLOCK_SAMPLES, round(_BLOCK_S / period))
         count = len(rest) // self._size
-        blocks, self._rest = (
-            rest[: count * self._size].reshape(count, self._size, 14),
-            rest[count * self._size :],
-        )
+        blocks, self._rest = np.split(rest, [count * self._size])
+        blocks = blocks.reshape(count, self._size, 14)
         mean, deviation = blocks[:, :, _ROW].mean(axis=1), blocks[:, :, _ROW].std(axis=1, ddof=1)
         quiet = blocks[:, :, _GOOD].all(axis=1) & (deviation <= _LIMITS.deviations).all(axis=1)
         quiet &= np.linalg.norm(mean[:, 9:12], axis=1) <= _LIMITS.angular_rate

@@ -138,10 +138,11 @@ class Columns:
                 continue
             for place, axis in enumerate(axes):
                 values[:, place] = table[axis]
+            if name == "orientation":
+                values[~values.any(axis=1)] = math.nan  # all zero: no estimate
         if imu_units is ImuUnits.G_DPS:
             np.multiply(self.acceleration, STANDARD_GRAVITY, out=self.acceleration)
             np.multiply(self.angular_rate, math.pi / 180.0, out=self.angular_rate)
-        self.orientation[~self.orientation.any(axis=1)] = math.nan  # all zero: no estimate
 
     @classmethod
     def of(cls, table: Table, imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:

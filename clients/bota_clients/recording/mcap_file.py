@@ -16,11 +16,12 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from array import array
 from collections import Counter
 from collections.abc import Collection, Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +29,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Metadata
+from mcap.records import Channel, Metadata
 
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
@@ -44,6 +45,8 @@ MAX_CHANNELS: Final = 4096
 _BARE: Final = 1024 * 1024  # bytes of messages outside of chunks that are taken for one
 
 _RECORD: Final = struct.Struct("<BQ")
+_CHUNK: Final = struct.Struct("<QQQII")  # times, size and CRC without compression, length of its name
+_U64: Final = struct.Struct("<Q")
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _LOOK_AHEAD: Final = 512  # records
 _SHORT: Final = 256  # bytes: longer ones than a frame
@@ -52,21 +55,13 @@ _INDEX: Final = struct.Struct("<HI")  # channel, bytes that follow: 16 for each 
 _FOOTER_SIZE: Final = struct.calcsize("<BQQQI8s")
 _UNREADABLE: Final = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError, RuntimeError)
 
+_Counts = tuple[tuple[int, int], ...]
 Rows = npt.NDArray[np.uint8]  # (n, bytes of each)
 RECORD_HEAD: Final = _RECORD.size
 HEAD: Final = RECORD_HEAD + _MESSAGE.size  # bytes before the body of a message
 CHANNEL: Final = slice(RECORD_HEAD, RECORD_HEAD + 2)  # where a message has its channel
 
-_Record = TypeVar("_Record", Channel, Chunk, Metadata)
-
-
-class _ChunkRecord(NamedTuple):
-    """The body of a chunk record in the file, and its number of messages by channel."""
-
-    offset: int
-    length: int
-    counts: Counter[int]
-    is_bare: bool = False  # records outside of chunks
+_Record = TypeVar("_Record", Channel, Metadata)
 
 
 def _alike(data: memoryview, position: int, stride: int) -> int:
@@ -119,10 +114,14 @@ class McapFile:
         self.topics: dict[int, str] = {}
         self.counts = Counter[int]()
         self.cut_off: str | None = None
-        self._chunks: list[_ChunkRecord] = []
+        # Of each chunk the position of its body, and messages by channel, a tuple for all that have the same:
+        # hours have a hundred thousand chunks.
+        self._chunks, self._counts = array("q"), list[_Counts]()
+        self._known: dict[_Counts, _Counts] = {}
+        self._bare: dict[int, int] = {}  # bytes of what is outside of chunks and taken for one
         self._zstd = zstandard.ZstdDecompressor()
         try:
-            self._file: BinaryIO = path.open("rb")
+            self._file = path.open("rb", buffering=0)
             try:
                 self._size = os.fstat(self._file.fileno()).st_size
                 self._open()
@@ -147,8 +146,8 @@ class McapFile:
         Shorter ones are padded with zeros. RecordingError at the first corrupt chunk.
         """
         with progress(self.path.name, len(self._chunks)) as reach:
-            for number, chunk in enumerate(self._chunks):
-                if not chunk.counts.keys().isdisjoint(channels):
+            for number, (chunk, counts) in enumerate(zip(self._chunks, self._counts, strict=True)):
+                if any(channel in channels for channel, _ in counts):
                     for opcode, rows in self._records_in(chunk):
                         if opcode == Opcode.MESSAGE:
                             yield rows
@@ -164,10 +163,10 @@ class McapFile:
             raise self._damaged(end, "a record is incomplete")
         if not has_footer:
             self._ignore_truncated_end(self._size - end)
-        for chunk in self._chunks:
-            if not chunk.counts or not chunk.counts.keys() <= self.topics.keys():
-                self._index_chunk(chunk)
-            self.counts.update(chunk.counts)
+        for number, counts in enumerate(self._counts):
+            if not counts or any(channel not in self.topics for channel, _ in counts):
+                self._counts[number] = counts = self._index_chunk(self._chunks[number])  # noqa: PLW2901
+            self.counts.update(dict(counts))
 
     def _scan(self) -> tuple[int, bool]:
         """Take the records of the data section; the position behind the last, and whether its end is there.
@@ -197,7 +196,7 @@ class McapFile:
                 self._unpack(self._chunks[-1])
                 break
             except RecordingError:  # after a power failure the last blocks of the file may be zeros
-                self._chunks.pop()
+                del self._chunks[-1], self._counts[-1]
                 more = f", and is read without {count(there - len(self._chunks), 'damaged chunk')} at its end"
         self.cut_off = f"it has no footer{more}"
 
@@ -207,53 +206,57 @@ class McapFile:
             record = self._parse(Metadata, self._read_at(body, length), body)
             self.notes[record.name] = record.metadata
         elif opcode == Opcode.CHUNK:
-            self._add(_ChunkRecord(body, length, Counter()))
+            self._add(body)
         elif opcode == Opcode.MESSAGE_INDEX:
             head = self._read_at(body, min(length, _INDEX.size))
             channel, size = _INDEX.unpack(head) if len(head) == _INDEX.size else (0, -1)
             if not self._chunks or not 0 <= size <= length - _INDEX.size or size % 16:
                 raise self._damaged(body, "a message index is malformed or belongs to no chunk")
-            self._chunks[-1].counts[channel] = size // 16
+            counts = *self._counts[-1], (channel, size // 16)
+            self._counts[-1] = self._known.setdefault(counts, counts)
         elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
             begin, size = body - _RECORD.size, _RECORD.size + length
-            last = self._chunks[-1] if self._chunks else None
-            if last and last.is_bare and last.offset + last.length == begin and last.length + size <= _BARE:
-                self._chunks[-1] = last._replace(length=last.length + size)
+            last = self._bare.get(self._chunks[-1], 0) if self._chunks else 0
+            if last and self._chunks[-1] + last == begin and last + size <= _BARE:
+                self._bare[self._chunks[-1]] = last + size
             else:
-                self._add(_ChunkRecord(begin, size, Counter(), is_bare=True))
+                self._add(begin)
+                self._bare[begin] = size
 
-    def _add(self, chunk: _ChunkRecord) -> None:
+    def _add(self, chunk: int) -> None:
         if len(self._chunks) >= MAX_CHUNKS:
-            raise self._damaged(chunk.offset, f"it has more than {MAX_CHUNKS} chunks")
+            raise self._damaged(chunk, f"it has more than {MAX_CHUNKS} chunks")
         self._chunks.append(chunk)
+        self._counts.append(())
 
-    def _index_chunk(self, chunk: _ChunkRecord) -> None:
+    def _index_chunk(self, chunk: int) -> _Counts:
         """Take the channels that a chunk introduces, and count its messages."""
-        chunk.counts.clear()
+        found = Counter[int]()
         for opcode, rows in self._records_in(chunk):
             if opcode == Opcode.MESSAGE:
                 numbers, counts = np.unique(rows[:, CHANNEL].copy().view("<u2"), return_counts=True)
-                chunk.counts.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
+                found.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
             elif opcode == Opcode.CHANNEL:
-                found = self._parse(Channel, memoryview(rows[0])[_RECORD.size :], chunk.offset)
-                self.topics[found.id] = found.topic
+                made = self._parse(Channel, memoryview(rows[0])[_RECORD.size :], chunk)
+                self.topics[made.id] = made.topic
                 if len(self.topics) > MAX_CHANNELS:
-                    raise self._damaged(chunk.offset, f"it has more than {MAX_CHANNELS} channels")
-        if unknown := chunk.counts.keys() - self.topics.keys():
-            raise self._damaged(chunk.offset, f"a message is on channel {min(unknown)}, which does not exist")
+                    raise self._damaged(chunk, f"it has more than {MAX_CHANNELS} channels")
+        if unknown := found.keys() - self.topics.keys():
+            raise self._damaged(chunk, f"a message is on channel {min(unknown)}, which does not exist")
+        return tuple(found.items())
 
-    def _records_in(self, chunk: _ChunkRecord) -> Iterator[tuple[int, Rows]]:
+    def _records_in(self, chunk: int) -> Iterator[tuple[int, Rows]]:
         """Opcode and rows of every record in a chunk; messages that are alike, or short, many at once."""
         data = self._unpack(chunk)
         position, size = 0, len(data)
         short = list[tuple[int, int]]()  # begin and end
         while position < size:
             if position + _RECORD.size > size:
-                raise self._damaged(chunk.offset, "a record in a chunk is incomplete")
+                raise self._damaged(chunk, "a record in a chunk is incomplete")
             opcode, length = _RECORD.unpack_from(data, position)
             stride = _RECORD.size + length
             if stride > size - position or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
-                raise self._damaged(chunk.offset, f"a record in a chunk claims {length} bytes")
+                raise self._damaged(chunk, f"a record in a chunk claims {length} bytes")
             count = _alike(data, position, stride) if opcode == Opcode.MESSAGE else 1
             end = position + count * stride
             if opcode == Opcode.MESSAGE and count == 1 and stride <= _SHORT:
@@ -267,34 +270,40 @@ class McapFile:
         if short:
             yield Opcode.MESSAGE, _padded(data, short)
 
-    def _unpack(self, chunk: _ChunkRecord) -> memoryview:
+    def _unpack(self, chunk: int) -> memoryview:
         """The decompressed records of a chunk."""
-        self._bound(chunk.offset, chunk.length, MAX_CHUNK)
-        if chunk.is_bare:
-            return memoryview(self._read_at(chunk.offset, chunk.length))
-        found = self._parse(Chunk, self._read_at(chunk.offset, chunk.length), chunk.offset)
-        size = found.uncompressed_size
-        self._bound(chunk.offset, size, MAX_CHUNK)
-        data = found.data
+        if chunk in self._bare:
+            self._bound(chunk, self._bare[chunk], MAX_CHUNK)
+            return memoryview(self._read_at(chunk, self._bare[chunk]))
+        (length,) = _U64.unpack(self._read_at(chunk - _U64.size, _U64.size))
+        self._bound(chunk, length, MAX_CHUNK)
+        body: Any = memoryview(self._file.read(length))
+        try:  # the library's parser takes half as long as what is decompressed
+            _, _, size, crc, named = _CHUNK.unpack_from(body)
+            compression, data = str(body[_CHUNK.size :][:named], "utf-8"), body[_CHUNK.size + named :]
+            data = data[8:][: _U64.unpack_from(data)[0]]
+        except _UNREADABLE:
+            raise self._damaged(chunk, "a Chunk record cannot be read") from None
+        self._bound(chunk, size, MAX_CHUNK)
         try:
-            if found.compression == "zstd":
+            if compression == "zstd":
                 if zstandard.frame_content_size(data) not in (-1, size):
                     raise ValueError("its sizes differ")
                 data = self._zstd.decompress(data, size)
-            elif found.compression == "lz4":
+            elif compression == "lz4":
                 from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415 - mcap needs it, and few files
 
                 data = LZ4FrameDecompressor().decompress(data, size + 1)
-            elif found.compression:
-                how = f"compressed with {printable(found.compression, 16)}, which is not read"
+            elif compression:
+                how = f"compressed with {printable(compression, 16)}, which is not read"
                 raise RecordingError(f"{self.path} is {how}: write it again with zstd, or none")
-            if found.uncompressed_crc not in (0, zlib.crc32(data)):
+            if crc not in (0, zlib.crc32(data)):
                 raise ValueError("its checksum differs")
             if len(data) != size:
                 raise ValueError(f"it has {len(data)} bytes instead of {size}")
             return memoryview(data)
         except _UNREADABLE as error:
-            raise self._damaged(chunk.offset, f"a chunk cannot be decompressed: {error}") from None
+            raise self._damaged(chunk, f"a chunk cannot be decompressed: {error}") from None
 
     def _read_at(self, offset: int, size: int) -> bytes:
         self._file.seek(offset)

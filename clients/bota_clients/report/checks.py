@@ -66,7 +66,8 @@ class _Windows:
         self._series, self._limit = series, _limits(series)
         self._length = max(_WINDOW_S, _FEWEST_SAMPLES * series.period)
         self._fewest = max(_FEWEST_SAMPLES // 2, int(_FILLED * self._length / series.period))
-        self._rest = np.zeros((0, 1 + 2 * len(CHANNELS)))  # of the window that goes on: time, values, usable
+        # Time, values and usable of the window that goes on.
+        self._rest: Sequence[Any] = np.zeros(0), np.zeros((0, 12)), np.zeros((0, 12), bool)
         self._count = 0
         self._every = 1  # one of so many windows is remembered
         self._kept = list[Floats]()  # (2, 12): deviation, range
@@ -74,22 +75,20 @@ class _Windows:
 
     def add(self, samples: Samples | None) -> None:
         """None: the end."""
-        table = self._rest
+        rows = self._rest
         if samples is not None:
-            new = np.column_stack([samples.time, samples.values, samples.usable])
-            table = np.concatenate([table, new])
-        number = np.floor(table[:, 0] / self._length).astype(np.int64)
+            rows = [np.concatenate(each) for each in zip(rows, samples[:3], strict=True)]
+        number = np.floor(rows[0] / self._length)
         # A clock that jumps back must not join samples that are far apart.
         edges = [0, *(np.flatnonzero(np.diff(number) != 0) + 1).tolist()]
-        if samples is None or len(table) - edges[-1] > _LONGEST_WINDOW:
-            edges.append(len(table))
+        if samples is None or len(number) - edges[-1] > _LONGEST_WINDOW:
+            edges.append(len(number))
         for begin, end in itertools.pairwise(edges):
             if end - begin >= self._fewest:
-                self._measure(table[begin:end])
-        self._rest = table[edges[-1] :]
+                self._measure(*(each[begin:end] for each in rows))
+        self._rest = [each[edges[-1] :] for each in rows]
 
-    def _measure(self, rows: Floats) -> None:
-        time, values, usable = rows[:, 0], rows[:, 1 : 1 + len(CHANNELS)], rows[:, 1 + len(CHANNELS) :] != 0
+    def _measure(self, time: Floats, values: Floats, usable: Bools) -> None:
         deviation, reach, rough = _window(time, values, usable)
         if _shaken(deviation, self._limit):
             rough = np.full(len(CHANNELS), np.nan)
@@ -199,7 +198,8 @@ def _window(time: Floats, values: Floats, usable: Bools) -> Floats:
     trend = basis @ (basis.T @ values)
     deviation = np.sqrt(np.sum((values - trend) ** 2, axis=0) / (len(time) - _ORDER - 1))
     deviation[(values == values[0]).all(axis=0)] = 0.0  # the fit leaves rounding errors
-    rough = np.median(np.abs(np.diff(values, 2, axis=0)), axis=0) * _TO_DEVIATION
+    bends = np.sort(np.abs(np.diff(values, 2, axis=0)).T)  # a median along rows takes five times as long
+    rough = bends[:, [(bends.shape[1] - 1) // 2, bends.shape[1] // 2]].mean(axis=1) * _TO_DEVIATION
     return np.where(good, [deviation, np.ptp(trend, axis=0), rough], np.nan)
 
 

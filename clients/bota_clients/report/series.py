@@ -309,11 +309,13 @@ class Envelope:
             index, values = index[order], values[order]
         begin = np.flatnonzero(np.diff(index, prepend=-1))
         at, good = index[begin], np.isfinite(values)
-        known = np.where(good, values, np.nan)
+        known = values if good.all() else np.where(good, values, np.nan)
         if len(at):
             self.low[at] = np.fmin(self.low[at], np.fmin.reduceat(known, begin))
             self.high[at] = np.fmax(self.high[at], np.fmax.reduceat(known, begin))
-            self._sums[at] += np.add.reduceat(np.where(good, values, 0.0), begin)
+            self._sums[at] += np.add.reduceat(
+                values if known is values else np.where(good, values, 0.0), begin
+            )
             self._counts[at] += np.add.reduceat(good, begin, dtype=np.int64)
 
 
@@ -433,17 +435,17 @@ class Series:
 
     def _measure(self, samples: Columns, intervals: Ints, lost: Ints, apart: Bools) -> Samples:
         time: Floats = np.multiply(samples.monotonic_ns - self._begin_ns, 1e-9)
-        values: Floats = np.hstack([getattr(samples, group.name) for group in GROUPS])
-        finite = np.isfinite(values)
+        table = np.column_stack([*(getattr(samples, group.name) for group in GROUPS), samples.temperature])
+        values, finite = table[:, :-1], np.isfinite(table)
         fields = [getattr(samples, channel.group.saturation) & channel.bit != 0 for channel in CHANNELS]
         flagged = [channel.flagged(samples) != 0 for channel in _OF_GROUP]
-        usable = finite & ~np.repeat(np.column_stack(flagged), 3, axis=1)
-        self.not_finite += int((~finite.all(axis=1) | ~np.isfinite(samples.temperature)).sum())
+        usable = finite[:, :-1] & ~np.repeat(np.column_stack(flagged), 3, axis=1)
+        self.not_finite += int((~finite.all(axis=1)).sum())
         for name in _BITS:
             self.bits[name] |= bits(getattr(samples, name))
         lengths = np.linalg.norm(samples.acceleration[finite[:, 6:9].all(axis=1)], axis=1)
         self._gravity.add(np.rint(np.minimum(lengths, _MOST_GRAVITY) / _GRAVITY_STEP).astype(np.int64))
-        self.envelope.add(time, np.column_stack([values, samples.temperature]))
+        self.envelope.add(time, table)
         bins = self.envelope.bins_of(time)
         rows, channels = np.nonzero(np.column_stack(fields))
         self.saturated[bins[rows], channels] = True
@@ -456,18 +458,19 @@ class Series:
         """(n,) how many samples are missing up to each frame, as every client counts them."""
         accounting, summed = self._accounting, np.zeros(len(part), np.int64)
         is_next = np.append(False, np.diff(part.sequence) == 1) & (part.flags == 0)
-        heads = zip(part.sequence.tolist(), part.monotonic_ns.tolist(), part.flags.tolist(), strict=True)
-        head, row = list(heads), 0
+        heads, row = (part.sequence, part.monotonic_ns, part.flags), 0
         for stop in [*np.flatnonzero(~is_next).tolist(), len(part)]:
             while row < min(stop + 1, len(part)):
-                if row < stop and accounting.count_next(*head[row][:2]):  # and so are all up to there
+                sequence, moment_ns, flags = (each[row].item() for each in heads)
+                if row < stop and accounting.count_next(sequence, moment_ns):  # and so are all up to there
                     if stop - row > 1:
-                        accounting.count_run(head[stop - 1][0])
-                        accounting.count_next(*head[stop - 1][:2])
+                        sequence, moment_ns = (each[stop - 1].item() for each in heads[:2])
+                        accounting.count_run(sequence)
+                        accounting.count_next(sequence, moment_ns)
                     summed[row:stop] = self.counts.missing
                     row = stop
                 else:
-                    accounting.count(*head[row])
+                    accounting.count(sequence, moment_ns, flags)
                     summed[row] = self.counts.missing
                     row += 1
         return summed
