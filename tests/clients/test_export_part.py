@@ -20,6 +20,7 @@ from bota_clients.recording.file_format import DESCRIPTION_TOPIC
 from bota_clients.recording.reader import REWRITTEN, UNKNOWN, open_recording
 from bota_clients.report.cli import main as report
 from bota_clients.report.series import of_recording
+from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import ImuUnits
 from bota_ft_compensation.identification.parameter_file import write_payload
 from tests.bridge.test_one_stream import recorded
@@ -104,8 +105,15 @@ def test_a_part_is_read_as_the_file_that_has_only_this_part(name: str, tmp_path:
     """Also what is in force: settings of before and after it are none of its own."""
     run, cut = recorded(STREAMS[name], tmp_path / "run.mcap"), tmp_path / "cut.mcap"
     export(run, cut, *SECONDS)
-    with open_recording(run, PART) as part, open_recording(cut) as file:
-        assert list(part.everything()) == list(file.everything())
+    with open_recording(run, PART) as part, open_recording(cut) as file, open_recording(run) as whole:
+        items = list(part.everything())
+        assert items == list(file.everything())
+        frames = [each for each in whole.frames() if LOW <= each.monotonic_ns - BEGIN_NS - PERIOD_NS < HIGH]
+        assert [each for each in items if isinstance(each, DataMessage)] == frames
+        notes = [each for each in items if not isinstance(each, DataMessage)]
+        assert (
+            notes == [each for each in whole.everything() if not isinstance(each, DataMessage)][: len(notes)]
+        )
         assert part.frame_count == file.frame_count
         for ours, theirs in zip(part.sensors, file.sensors, strict=True):
             assert (ours.info, ours.frames) == (theirs.info, theirs.frames)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import itertools
 import json
 import os
@@ -233,12 +234,19 @@ def bridged(there: Sequence[str], veth: Veth) -> Iterator[str]:
             subprocess.run([*there, "ip", "link", "del", each], check=True)
 
 
-@pytest.mark.parametrize("elsewhere", [False, True])
-def test_a_bridge_on_the_way_is_why_no_slave_answers(elsewhere: bool) -> None:
+@pytest.mark.parametrize("elsewhere", ["", "there", "there, with the same number"])
+def test_a_bridge_on_the_way_is_why_no_slave_answers(elsewhere: str) -> None:
     """The kernel drops the frames; where the bridge is in another network namespace, too."""
     with contextlib.ExitStack() as stack:
         veth = stack.enter_context(Veth())
         there = stack.enter_context(another_machine(veth)) if elsewhere else []
+        if "same" in elsewhere:
+            veth.ip("link", "del", veth.near)
+            number, other = ["index", "777"], ["netns", there[1].split("/")[2]]
+            pair = [*number, "type", "veth", "peer", "name", veth.far, *number, *other]
+            veth.ip("link", "add", veth.near, "up", *pair)
+            subprocess.run([*there, "ip", "link", "set", veth.far, "up"], check=True)
+            wait_until(lambda: look_up(veth.near).carrier, "the carrier")
         assert why_silent(veth.near) == "check cable and power"
         bridge = stack.enter_context(bridged(there, veth))
         why = f"{veth.near} is connected to {bridge}, a bridge, which drops EtherCAT frames"
@@ -469,6 +477,16 @@ def test_the_interface_with_a_route_to_elsewhere_is_refused_by_all(routes: str, 
     assert virtual == [f"ethercat-virtual-sensor: {server}", "1"]
 
 
+def test_what_stands_on_what_stands_on_an_interface_is_carried_by_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As VLANs on VLANs, which are numbered as they were made; not the other end of a pair."""
+    links = {5: 0, 9: 5, 8: 9, 7: 8, 6: 3, 4: 5, 3: 8}
+    rows = [replace(SEES, ifindex=index, link=link, kind="vlan") for index, link in sorted(links.items())]
+    rows[1] = replace(rows[1], kind="veth")
+    rows[0] = replace(rows[0], namespace=1)
+    monkeypatch.setattr(nic, "interfaces", lambda: rows)
+    assert nic._carried_by(5) == {5, 9, 8, 7}
+
+
 def test_no_service_is_installed_for_one() -> None:
     routes = "ip route add default nexthop via 192.0.2.1 nexthop via 192.0.2.2"
     install = Path(__file__).parents[2] / "scripts/install-service"
@@ -690,8 +708,12 @@ def another(ifname: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def test_the_process_that_has_the_interface_is_named_until_it_ends_in_any_way(
-    veth: Veth, tmp_path: Path
+    veth: Veth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Also where another's lock is of a file whose number ends alike."""
+    original, lock = Path.read_text, r"^(.*FLOCK\s+\S+\s+\S+) \d+ (\S+:)(\d+) (.*)$"
+    alike = functools.partial(re.sub, lock, r"\1 1 \g<2>1\3 \4\n\g<0>", flags=re.MULTILINE)
+    monkeypatch.setattr(Path, "read_text", lambda path, **how: alike(original(path, **how)))
     before, after = ((tmp_path / name).open("w") for name in "ab")
     fcntl.flock(before, fcntl.LOCK_EX)
     with before, after, another(veth.near) as process:

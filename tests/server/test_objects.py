@@ -638,6 +638,10 @@ def test_emergencies_are_told_at_a_bounded_rate_and_all_are_counted(caplog: pyte
     clock.sleep(1.2344)
     last = {"code": 0x6008, "text": "software of the device", "register": 0x81, "data": "0102"}
     assert known.status(1) == {"emergencies": 23, "emergency": {**last, "ago_s": 1.234}}
+    assert note(0x6008) == [(1, 0x6008, 24)]
+    clock.sleep(0.5)
+    assert note(0x6008) == []
+    assert known.status(1) == {"emergencies": 25, "emergency": {**last, "ago_s": 0.0}}
 
 
 @pytest.mark.parametrize(

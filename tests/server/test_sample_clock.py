@@ -176,6 +176,15 @@ def test_no_sample_is_dated_after_its_arrival(seed: int, controller: Controller 
     assert all(sample.stamp_ns <= sample.back_ns for sample in simulation.samples)
 
 
+@pytest.mark.parametrize("back_ns", [1, 1000, 10**6])
+def test_a_sample_that_comes_before_it_is_expected_is_dated_when_it_was_there(back_ns: int) -> None:
+    clock = ClockSimulation(Sensor(800.0), Card(110e3), QUIET, 1).run(3.0).clock
+    expected_ns = int(clock.phase.phase_ns)
+    assert clock.observe(expected_ns - 50_000, expected_ns + back_ns, None, fresh=True)
+    assert expected_ns < clock.instant_ns <= expected_ns + back_ns
+    assert (clock.instant_ns == expected_ns + back_ns) is (back_ns < 50_000)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("stolen", [0.0, 0.02, 0.05, 0.1])
 @pytest.mark.parametrize("first", range(0, 1000, 100))
