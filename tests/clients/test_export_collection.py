@@ -71,6 +71,18 @@ def test_what_is_unchanged_is_left_and_what_is_bad_is_named(runs: list[Path], tm
     assert not [*folder.glob(".unfinished*")]
 
 
+def test_a_name_in_another_encoding_is_no_obstacle(runs: list[Path], tmp_path: Path) -> None:
+    """As of a file from another machine."""
+    other = runs[0].rename(tmp_path / os.fsdecode(b"caf\xe9.mcap"))
+    assert "140 rows of 2 recordings written" in data_set(other, runs[2], f"{tmp_path}/data/")
+    assert table(other)["recording"][0].as_py() == "caf?.mcap"
+    assert "2 unchanged" in data_set(other, runs[2], f"{tmp_path}/data/")
+    out = other.with_suffix(".parquet")
+    assert f"{out} cannot be written: its name is not UTF-8" in data_set(runs[2], out, code=1)
+    said = data_set(*runs[2:], other.with_suffix(""), code=1)
+    assert f"{runs[2]} cannot be exported: the name of {other.with_suffix('')} is not UTF-8" in said
+
+
 @pytest.mark.parametrize("wrong", [["--all"], ["--fps", "30"], ["--mcap", "x.mcap"]])
 def test_a_data_set_has_all_samples(runs: list[Path], tmp_path: Path, wrong: list[str]) -> None:
     assert "a data set has all samples" in data_set(*runs[:2], tmp_path / "data", *wrong, code=2)

@@ -34,6 +34,7 @@ from bota_clients.recording.asked import Asked
 from bota_clients.recording.reader import Recording, open_recording
 from bota_ethercat.errors import FileError, ProtocolError
 from bota_ethercat.program.version import VERSION
+from bota_ethercat.text.untrusted import visible
 
 _GROUP: Final = 131_072  # rows
 _BEGINNING: Final = 1024  # bytes that tell recordings apart
@@ -58,8 +59,8 @@ def tables_of(options: argparse.Namespace, recording: Recording, sensor: int | N
     blocks = in_part(recording, windows, samples_of(recording, windows, chosen.sensor))
     for block in in_chunks(blocks, _GROUP):
         rows = arrow_of(block, said)
-        numbers = pa.repeat(pa.scalar(0, pa.int32()), len(rows))
-        yield rows.append_column("recording", pa.DictionaryArray.from_arrays(numbers, [recording.path.name]))
+        numbers, name = pa.repeat(pa.scalar(0, pa.int32()), len(rows)), visible(recording.path.name)
+        yield rows.append_column("recording", pa.DictionaryArray.from_arrays(numbers, [name]))
 
 
 def _source(path: Path, options: argparse.Namespace) -> tuple[str, str]:
@@ -70,7 +71,7 @@ def _source(path: Path, options: argparse.Namespace) -> tuple[str, str]:
     tool = options.tool and hashlib.sha256(options.tool.read_bytes()).hexdigest()
     made_of = [found.st_size, found.st_mtime_ns, tool, options.imu_units.value, options.sensor, VERSION]
     made_of += [*Asked.of(options)]
-    return f"{path.stem}-{digest}.parquet", json.dumps(made_of)
+    return f"{visible(path.stem)}-{digest}.parquet", json.dumps(made_of)
 
 
 def _there(folder: Path, path: Path, name: str) -> dict[Path, Any]:
@@ -78,7 +79,7 @@ def _there(folder: Path, path: Path, name: str) -> dict[Path, Any]:
     from pyarrow import parquet  # noqa: PLC0415 - of the extra `dataset`
 
     found = dict[Path, Any]()
-    for file in folder.glob(f"serial=*/day=*/{glob.escape(path.stem)}-????????.parquet"):
+    for file in folder.glob(f"serial=*/day=*/{glob.escape(visible(path.stem))}-????????.parquet"):
         source = json.loads((parquet.read_metadata(file).metadata or {}).get(_SOURCE.encode(), "{}"))
         if file.name == name or source.get("path") == str(path.resolve()):
             found[file] = source
@@ -126,6 +127,8 @@ def add(path: Path, options: argparse.Namespace) -> Done:
         return Done(0, why=str(error))
     except OSError as error:
         return Done(0, why=f"{path} cannot be exported: {error.strerror or error}")
+    except UnicodeEncodeError:  # by pyarrow
+        return Done(0, why=f"{path} cannot be exported: the name of {folder} is not UTF-8")
     return Done(rows)
 
 
