@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from pyarrow import dataset, parquet
 
 from bota_clients import progress
-from bota_clients.export import batches, table
+from bota_clients.export import batches, collection, table
 from bota_clients.export.cli import main
 from tests.clients.recordings import START_NS, describe, frame, record, write
 from tests.ended import run_here
@@ -81,6 +82,22 @@ def test_a_name_in_another_encoding_is_no_obstacle(runs: list[Path], tmp_path: P
     assert f"{out} cannot be written: its name is not UTF-8" in data_set(runs[2], out, code=1)
     said = data_set(*runs[2:], other.with_suffix(""), code=1)
     assert f"{runs[2]} cannot be exported: the name of {other.with_suffix('')} is not UTF-8" in said
+
+
+def test_until_it_is_complete_no_reader_finds_it(
+    runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Polars would fail at what a process that was killed has left."""
+    seen, tables_of = list[Path](), collection.tables_of
+
+    def watched(*arguments: Any) -> Iterator[Any]:
+        for each in tables_of(*arguments):
+            yield each
+            seen.extend((tmp_path / "data").rglob("*.parquet"))
+
+    monkeypatch.setattr(collection, "tables_of", watched)
+    data_set(runs[1], f"{tmp_path}/data/")
+    assert (seen, len([*(tmp_path / "data").rglob("*.parquet")])) == ([], 2)
 
 
 @pytest.mark.parametrize("wrong", [["--all"], ["--fps", "30"], ["--mcap", "x.mcap"]])

@@ -112,15 +112,15 @@ def add(path: Path, options: argparse.Namespace) -> Done:
                 day = next(each.as_py() for each in first["stamp_utc"].cast("date32") if each.is_valid)
                 serial = choose(recording, sensor).info.serial
                 made.append(Path(f"serial={serial}", f"day={day}", name))
-                target = Path(beside, made[-1])
-                target.parent.mkdir(parents=True, exist_ok=True)
+                # No name that data/**/*.parquet finds, if this process is killed.
+                target = Path(beside, str(len(made)))
                 with parquet_writer(target, first.schema, {_SOURCE: source}) as writer:
                     for table in itertools.chain([first], tables):
                         writer.write_table(table)
                         rows += len(table)
-            for each in made:
+            for number, each in enumerate(made, 1):
                 (folder / each).parent.mkdir(parents=True, exist_ok=True)
-                Path(beside, each).replace(folder / each)
+                Path(beside, str(number)).replace(folder / each)
             for each in {*there} - {folder / new for new in made}:
                 each.unlink()
     except (RecordingError, ProtocolError) as error:
