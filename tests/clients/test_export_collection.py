@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator
+from concurrent.futures import as_completed
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +99,24 @@ def test_until_it_is_complete_no_reader_finds_it(
     monkeypatch.setattr(collection, "tables_of", watched)
     data_set(runs[1], f"{tmp_path}/data/")
     assert (seen, len([*(tmp_path / "data").rglob("*.parquet")])) == ([], 2)
+
+
+def test_ctrl_c_leaves_what_is_complete_and_says_so(
+    runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if it killed a process that was writing."""
+
+    def interrupted(waiting: Any) -> Iterator[Any]:
+        first, *_ = as_completed(waiting)
+        yield first
+        [unfinished] = (tmp_path / "data").glob(".unfinished-*")
+        (unfinished / "left").write_text("")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(collection, "as_completed", interrupted)
+    said = data_set(*runs, f"{tmp_path}/data/", code=1)
+    assert said == "ethercat-export: stopped after 1 of 4 recordings: run it again for the others\n"
+    assert {path.name.partition("=")[0] for path in (tmp_path / "data").iterdir()} == {"serial"}
 
 
 @pytest.mark.parametrize("wrong", [["--all"], ["--fps", "30"], ["--mcap", "x.mcap"]])

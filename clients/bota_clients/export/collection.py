@@ -86,8 +86,8 @@ def _there(folder: Path, path: Path, name: str) -> dict[Path, Any]:
     return found
 
 
-def add(path: Path, options: argparse.Namespace) -> Done:
-    """Write the samples of a recording into the data set."""
+def add(path: Path, options: argparse.Namespace, unfinished: str) -> Done:
+    """Write the samples of a recording into the data set, from a folder in which they become complete."""
     folder: Path = options.output
     try:
         name, made_of = _source(path, options)
@@ -96,10 +96,8 @@ def add(path: Path, options: argparse.Namespace) -> Done:
         if of and not options.force and {*of} == {(made_of, len(of))}:
             return Done(0, is_unchanged=True)
         rows, made = 0, list[Path]()
-        unfinished = tempfile.TemporaryDirectory(
-            prefix=".unfinished-", dir=folder, ignore_cleanup_errors=True
-        )
-        with open_recording(path, Asked.of(options)) as recording, unfinished as beside:
+        own = tempfile.TemporaryDirectory(dir=unfinished, ignore_cleanup_errors=True)
+        with open_recording(path, Asked.of(options)) as recording, own as beside:
             sensors = [each.sensor for each in recording.sensors if each.frames]
             if options.sensor is not None:
                 sensors = [choose(recording, options.sensor).sensor]
@@ -132,6 +130,29 @@ def add(path: Path, options: argparse.Namespace) -> Done:
     return Done(rows)
 
 
+def _add_all(paths: list[Path], options: argparse.Namespace, beside: str) -> list[tuple[Path, Done]]:
+    """What became of each."""
+    found, workers = list[tuple[Path, Done]](), min(os.cpu_count() or 1, len(paths))
+    if workers < 2:
+        return [(path, add(path, options, beside)) for path in paths]
+    with (
+        progress(f"{len(paths)} recordings", len(paths)) as reach,
+        ProcessPoolExecutor(workers, get_context("spawn"), switch_off) as pool,
+    ):
+        waiting = {pool.submit(add, path, options, beside): path for path in paths}
+        try:
+            for each in as_completed(waiting):
+                found.append((waiting[each], each.result()))
+                reach(len(found))
+        except BaseException as error:
+            pool.shutdown(cancel_futures=True)
+            if isinstance(error, KeyboardInterrupt):
+                done = f"stopped after {len(found)} of {len(paths)} recordings"
+                raise RecordingError(f"{done}: run it again for the others") from None
+            raise
+    return found
+
+
 def run(options: argparse.Namespace) -> int:
     """Write or complete the data set, with as many processes as processors; bad recordings are named."""
     interrupt_on_signals()
@@ -140,25 +161,15 @@ def run(options: argparse.Namespace) -> int:
         read_tool(options.tool)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        # Of this process: Ctrl-C kills those that work for it.
+        unfinished = tempfile.TemporaryDirectory(
+            prefix=".unfinished-", dir=folder, ignore_cleanup_errors=True
+        )
     except OSError as error:
-        raise FileError(f"{folder} cannot be made: {error.strerror or error}") from None
-    paths, found = options.recordings, list[tuple[Path, Done]]()
-    workers = min(os.cpu_count() or 1, len(paths))
-    if workers < 2:
-        found = [(path, add(path, options)) for path in paths]
-    else:
-        with (
-            progress(f"{len(paths)} recordings", len(paths)) as reach,
-            ProcessPoolExecutor(workers, get_context("spawn"), switch_off) as pool,
-        ):
-            waiting = {pool.submit(add, path, options): path for path in paths}
-            try:
-                for each in as_completed(waiting):
-                    found.append((waiting[each], each.result()))
-                    reach(len(found))
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+        raise FileError(f"{folder} cannot be written: {error.strerror or error}") from None
+    with unfinished as beside:
+        found = _add_all(options.recordings, options, beside)
+    paths = options.recordings
     bad = [done.why for path, done in sorted(found) if done.why]
     unchanged = sum(done.is_unchanged for _, done in found)
     rows = count(sum(done.rows for _, done in found), "row")
