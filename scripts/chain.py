@@ -139,6 +139,9 @@ def stoppable(run: Callable[[], int], program: str, sentence: str, code: int) ->
 
     If it is stopped, the sentence is said and the code returned.
     """
+    from bota_ethercat.program.start import open_streams  # noqa: PLC0415 - it sets the action of SIGINT
+
+    open_streams()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _on_signal)
     if "DEMO_DIRECTORY" not in os.environ:

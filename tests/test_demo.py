@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +12,7 @@ import pytest
 
 from scripts.demonstration import program
 from scripts.demonstration.program import Shown
+from tests.ended import completed
 
 PERIOD_NS, AGE_NS = 1_250_000, 400_000
 
@@ -91,3 +94,16 @@ def test_a_wrong_time_is_refused(
     with pytest.raises(SystemExit):
         program._demo()
     assert "must be a number of seconds from 0.5" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("closed", ["", "<&-", ">&-", "<&- >&- 2>&-"])
+def test_it_runs_with_closed_streams_and_without_unicode(closed: str) -> None:
+    script = (
+        "import sys; from scripts.chain import stoppable; "
+        "run = lambda: print(chr(178), sys.stdin.isatty(), flush=True) or 5; "
+        "sys.exit(stoppable(run, 'demo', '', 0))"
+    )
+    ascii_only = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = completed("sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-c", script, env=ascii_only)
+    assert (done.returncode, done.stderr) == (5, "")
+    assert done.stdout == ("" if ">" in closed else "\\xb2 False\n")

@@ -42,6 +42,17 @@ quietly bash "$1/pip" "$1"
     assert re.fullmatch(rf"\d+ s, \d+ MB in {tmp_path} \(numpy\)", line), said
 
 
+def test_what_is_stopped_leaves_no_process(tmp_path: Path) -> None:
+    """`python -m venv` starts another, which would go on to fill the folder that the next run removes."""
+    script = """
+runs() { kill -0 "$child" 2>/dev/null; }
+trap 'stop_installer; read -r child <"$filling/child"; while runs; do sleep 0.02; done; exit 7' TERM
+(until [ -s "$1/child" ]; do sleep 0.02; done; kill $$) &
+quietly bash -c 'sleep 600 & echo $! >"$0/child"; wait' "$1"
+"""
+    assert run(script, tmp_path) == (7, "")
+
+
 def test_an_activated_environment_does_not_make_the_next_one(tmp_path: Path) -> None:
     """It may be .venv, which is removed first."""
     (tmp_path / "python3").symlink_to(sys.executable)

@@ -212,7 +212,25 @@ sys.exit({entry}())
     assert (done.returncode, done.stderr, len(done.stdout.split())) == (-signal.SIGINT, "", 1)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("nohup", [False, True])
+def test_a_lost_terminal_stops_a_program_after_the_change_it_makes(nohup: bool) -> None:
+    script = f"""
+import os, signal
+from bota_ethercat.program.signals import interrupt_on_signals, signals_held_back
+signal.signal(signal.SIGHUP, signal.{"SIG_IGN" if nohup else "SIG_DFL"})
+interrupt_on_signals()
+try:
+    with signals_held_back():
+        os.kill(os.getpid(), signal.SIGHUP)
+        print("changed", end="")
+except KeyboardInterrupt:
+    print(" stopped", end="")
+"""
+    done = completed(sys.executable, "-c", script)
+    assert (done.returncode, done.stdout) == (0, "changed" if nohup else "changed stopped")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_while_interfaces_are_listed_is_no_traceback(number: int) -> None:
     code, said, found = interrupted("ethercat-sensor", number, "socket.__new__", "find")
     assert (code, said, found) == (1, "ethercat-sensor: stopped\n", "")

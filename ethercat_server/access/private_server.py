@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from bota_ethercat.client.channel import RECEIVE_BUFFER, TcpChannel
+from bota_ethercat.program.signals import asking
 from ethercat_server.acquisition.start_up import AsFound
 from ethercat_server.ethercat.bus import Bus
 from ethercat_server.ethercat.options import VIRTUAL_INTERFACE
@@ -90,7 +91,7 @@ class PrivateServer:
 
     def _run(self) -> None:
         # Python handles signals in the main thread; they must interrupt its system calls.
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+        signal.pthread_sigmask(signal.SIG_BLOCK, asking())
         try:
             realtime.prepare(self._rt_priority, self._cpu)
             self.real_time = os.sched_getscheduler(0) == os.SCHED_FIFO

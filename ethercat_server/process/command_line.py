@@ -27,7 +27,7 @@ def begin(program: str) -> None:
 def run(program: str, work: Callable[[], int], *, as_json: bool) -> int:
     """The exit code: what `work` returns, or that of the error it raises, which is printed as one sentence.
 
-    SIGINT and SIGTERM raise KeyboardInterrupt in `work`; before, they end the program at once.
+    SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt in `work`; before, they end the program at once.
     With `as_json` the sentence is on standard output too, as {"error": ...}.
     """
     try:

@@ -173,11 +173,5 @@ def _demo() -> int:
     return run(parser.parse_args().seconds)
 
 
-def main() -> int:
-    """Parse the arguments and run."""
-    sys.stdout.reconfigure(errors="replace")  # type: ignore[union-attr]
-    return stoppable(_demo, "demo", "stopped before anything was measured", 0)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(stoppable(_demo, "demo", "stopped before anything was measured", 0))

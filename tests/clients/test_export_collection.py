@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
+from concurrent.futures import as_completed
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import pytest
 from pyarrow import dataset, parquet
 
 from bota_clients import progress
-from bota_clients.export import batches, table
+from bota_clients.export import batches, collection, table
 from bota_clients.export.cli import main
 from tests.clients.recordings import START_NS, describe, frame, record, write
 from tests.ended import run_here
@@ -69,6 +71,52 @@ def test_what_is_unchanged_is_left_and_what_is_bad_is_named(runs: list[Path], tm
     assert "1 unchanged" in data_set(runs[0], folder)
     assert "100 rows of 1 recording written" in data_set(runs[0], folder, "--force")
     assert not [*folder.glob(".unfinished*")]
+
+
+def test_a_name_in_another_encoding_is_no_obstacle(runs: list[Path], tmp_path: Path) -> None:
+    """As of a file from another machine."""
+    other = runs[0].rename(tmp_path / os.fsdecode(b"caf\xe9.mcap"))
+    assert "140 rows of 2 recordings written" in data_set(other, runs[2], f"{tmp_path}/data/")
+    assert table(other)["recording"][0].as_py() == "caf?.mcap"
+    assert "2 unchanged" in data_set(other, runs[2], f"{tmp_path}/data/")
+    out = other.with_suffix(".parquet")
+    assert f"{out} cannot be written: its name is not UTF-8" in data_set(runs[2], out, code=1)
+    said = data_set(*runs[2:], other.with_suffix(""), code=1)
+    assert f"{runs[2]} cannot be exported: the name of {other.with_suffix('')} is not UTF-8" in said
+
+
+def test_until_it_is_complete_no_reader_finds_it(
+    runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Polars would fail at what a process that was killed has left."""
+    seen, tables_of = list[Path](), collection.tables_of
+
+    def watched(*arguments: Any) -> Iterator[Any]:
+        for each in tables_of(*arguments):
+            yield each
+            seen.extend((tmp_path / "data").rglob("*.parquet"))
+
+    monkeypatch.setattr(collection, "tables_of", watched)
+    data_set(runs[1], f"{tmp_path}/data/")
+    assert (seen, len([*(tmp_path / "data").rglob("*.parquet")])) == ([], 2)
+
+
+def test_ctrl_c_leaves_what_is_complete_and_says_so(
+    runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if it killed a process that was writing."""
+
+    def interrupted(waiting: Any) -> Iterator[Any]:
+        first, *_ = as_completed(waiting)
+        yield first
+        [unfinished] = (tmp_path / "data").glob(".unfinished-*")
+        (unfinished / "left").write_text("")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(collection, "as_completed", interrupted)
+    said = data_set(*runs, f"{tmp_path}/data/", code=1)
+    assert said == "ethercat-export: stopped after 1 of 4 recordings: run it again for the others\n"
+    assert {path.name.partition("=")[0] for path in (tmp_path / "data").iterdir()} == {"serial"}
 
 
 @pytest.mark.parametrize("wrong", [["--all"], ["--fps", "30"], ["--mcap", "x.mcap"]])

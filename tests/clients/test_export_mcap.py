@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections import Counter
@@ -26,6 +27,7 @@ from tests.corpus import STREAMS
 from tests.ended import completed, run_here
 from tests.server.running import PATIENCE_S, wait_until
 
+MAIN = "from bota_clients.export.cli import main; raise SystemExit(main())"
 Message = tuple[str, int, int, int, bytes]
 
 
@@ -147,3 +149,22 @@ def test_chunks_of_another_compressor_are_refused_as_what_they_are(tmp_path: Pat
     ended = run_here(main, run, tmp_path / "a.csv")
     what = f"{run} is compressed with lz4f, which is not read: write it again with zstd, or none"
     assert (ended.code, ended.err) == (1, f"ethercat-export: {what}\n")
+
+
+def test_what_cannot_be_written_is_named_as_asked_for(tmp_path: Path) -> None:
+    """A pipe or a device is not replaced, also by root; of a regular file nothing is left."""
+    record(run := tmp_path / "run.mcap", map(frame, range(4000)))
+    (link := tmp_path / "link").symlink_to(tmp_path / "target.mcap")
+    os.mkfifo(pipe := tmp_path / "pipe")
+    read = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    for option in ("--mcap", "--ros"):
+        said = f"ethercat-export: {pipe} cannot be written: Illegal seek"
+        assert said in run_here(main, run, option, pipe, "--force").err
+        assert pipe.is_fifo()
+        assert f"{link}: " in export(run, option, link, "--force")
+        assert link.is_symlink()
+        limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096)); {MAIN}"
+        done = completed(sys.executable, "-c", limited, run, option, tmp_path / "out.mcap")
+        assert done.stderr == f"ethercat-export: {tmp_path / 'out.mcap'} cannot be written: File too large\n"
+    assert {path.name for path in tmp_path.iterdir()} == {"run.mcap", "link", "target.mcap", "pipe"}
+    os.close(read)

@@ -24,6 +24,7 @@ from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import ImuUnits
 from bota_ft_compensation.identification.parameter_file import write_payload
 from tests.bridge.test_one_stream import recorded
+from tests.clients.recordings import write
 from tests.compensation.making import BIAS, TOOL
 from tests.corpus import BEGIN_NS, EPOCH_NS, OFFSET, PERIOD_NS, STREAMS
 from tests.ended import run_here
@@ -143,6 +144,12 @@ def test_what_cannot_be_is_one_sentence(program: Any, part: list[Any], said: str
     ended = run_here(program, run, *part)
     assert (ended.code > 0, said in ended.err.splitlines()[-1]) == (True, True), ended.err
     assert [*tmp_path.iterdir()] == [run]
+
+
+def test_a_part_of_nothing_is_nothing(tmp_path: Path) -> None:
+    write(tmp_path / "run.mcap", [])
+    ended = run_here(main, tmp_path / "run.mcap", "--from", 3)
+    assert ended.err == f"ethercat-export: {tmp_path}/run.mcap has no samples\n"
 
 
 def rewritten(source: Path, path: Path, *, described: bool = True, **options: Any) -> Path:

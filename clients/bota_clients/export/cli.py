@@ -155,6 +155,8 @@ def run(options: argparse.Namespace) -> int:
             written = write(options, recording)
     except OSError as error:
         raise FileError(f"{options.output} cannot be written: {error.strerror or error}") from None
+    except UnicodeEncodeError:  # by pyarrow
+        raise FileError(f"{options.output} cannot be written: its name is not UTF-8") from None
     say(PROGRAM, f"{options.output}: {written}")
     return 0
 

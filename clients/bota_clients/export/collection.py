@@ -34,6 +34,7 @@ from bota_clients.recording.asked import Asked
 from bota_clients.recording.reader import Recording, open_recording
 from bota_ethercat.errors import FileError, ProtocolError
 from bota_ethercat.program.version import VERSION
+from bota_ethercat.text.untrusted import visible
 
 _GROUP: Final = 131_072  # rows
 _BEGINNING: Final = 1024  # bytes that tell recordings apart
@@ -58,8 +59,8 @@ def tables_of(options: argparse.Namespace, recording: Recording, sensor: int | N
     blocks = in_part(recording, windows, samples_of(recording, windows, chosen.sensor))
     for block in in_chunks(blocks, _GROUP):
         rows = arrow_of(block, said)
-        numbers = pa.repeat(pa.scalar(0, pa.int32()), len(rows))
-        yield rows.append_column("recording", pa.DictionaryArray.from_arrays(numbers, [recording.path.name]))
+        numbers, name = pa.repeat(pa.scalar(0, pa.int32()), len(rows)), visible(recording.path.name)
+        yield rows.append_column("recording", pa.DictionaryArray.from_arrays(numbers, [name]))
 
 
 def _source(path: Path, options: argparse.Namespace) -> tuple[str, str]:
@@ -70,7 +71,7 @@ def _source(path: Path, options: argparse.Namespace) -> tuple[str, str]:
     tool = options.tool and hashlib.sha256(options.tool.read_bytes()).hexdigest()
     made_of = [found.st_size, found.st_mtime_ns, tool, options.imu_units.value, options.sensor, VERSION]
     made_of += [*Asked.of(options)]
-    return f"{path.stem}-{digest}.parquet", json.dumps(made_of)
+    return f"{visible(path.stem)}-{digest}.parquet", json.dumps(made_of)
 
 
 def _there(folder: Path, path: Path, name: str) -> dict[Path, Any]:
@@ -78,15 +79,15 @@ def _there(folder: Path, path: Path, name: str) -> dict[Path, Any]:
     from pyarrow import parquet  # noqa: PLC0415 - of the extra `dataset`
 
     found = dict[Path, Any]()
-    for file in folder.glob(f"serial=*/day=*/{glob.escape(path.stem)}-????????.parquet"):
+    for file in folder.glob(f"serial=*/day=*/{glob.escape(visible(path.stem))}-????????.parquet"):
         source = json.loads((parquet.read_metadata(file).metadata or {}).get(_SOURCE.encode(), "{}"))
         if file.name == name or source.get("path") == str(path.resolve()):
             found[file] = source
     return found
 
 
-def add(path: Path, options: argparse.Namespace) -> Done:
-    """Write the samples of a recording into the data set."""
+def add(path: Path, options: argparse.Namespace, unfinished: str) -> Done:
+    """Write the samples of a recording into the data set, from a folder in which they become complete."""
     folder: Path = options.output
     try:
         name, made_of = _source(path, options)
@@ -95,10 +96,8 @@ def add(path: Path, options: argparse.Namespace) -> Done:
         if of and not options.force and {*of} == {(made_of, len(of))}:
             return Done(0, is_unchanged=True)
         rows, made = 0, list[Path]()
-        unfinished = tempfile.TemporaryDirectory(
-            prefix=".unfinished-", dir=folder, ignore_cleanup_errors=True
-        )
-        with open_recording(path, Asked.of(options)) as recording, unfinished as beside:
+        own = tempfile.TemporaryDirectory(dir=unfinished, ignore_cleanup_errors=True)
+        with open_recording(path, Asked.of(options)) as recording, own as beside:
             sensors = [each.sensor for each in recording.sensors if each.frames]
             if options.sensor is not None:
                 sensors = [choose(recording, options.sensor).sensor]
@@ -111,22 +110,47 @@ def add(path: Path, options: argparse.Namespace) -> Done:
                 day = next(each.as_py() for each in first["stamp_utc"].cast("date32") if each.is_valid)
                 serial = choose(recording, sensor).info.serial
                 made.append(Path(f"serial={serial}", f"day={day}", name))
-                target = Path(beside, made[-1])
-                target.parent.mkdir(parents=True, exist_ok=True)
+                # No name that data/**/*.parquet finds, if this process is killed.
+                target = Path(beside, str(len(made)))
                 with parquet_writer(target, first.schema, {_SOURCE: source}) as writer:
                     for table in itertools.chain([first], tables):
                         writer.write_table(table)
                         rows += len(table)
-            for each in made:
+            for number, each in enumerate(made, 1):
                 (folder / each).parent.mkdir(parents=True, exist_ok=True)
-                Path(beside, each).replace(folder / each)
+                Path(beside, str(number)).replace(folder / each)
             for each in {*there} - {folder / new for new in made}:
                 each.unlink()
     except (RecordingError, ProtocolError) as error:
         return Done(0, why=str(error))
     except OSError as error:
         return Done(0, why=f"{path} cannot be exported: {error.strerror or error}")
+    except UnicodeEncodeError:  # by pyarrow
+        return Done(0, why=f"{path} cannot be exported: the name of {folder} is not UTF-8")
     return Done(rows)
+
+
+def _add_all(paths: list[Path], options: argparse.Namespace, beside: str) -> list[tuple[Path, Done]]:
+    """What became of each."""
+    found, workers = list[tuple[Path, Done]](), min(os.cpu_count() or 1, len(paths))
+    if workers < 2:
+        return [(path, add(path, options, beside)) for path in paths]
+    with (
+        progress(f"{len(paths)} recordings", len(paths)) as reach,
+        ProcessPoolExecutor(workers, get_context("spawn"), switch_off) as pool,
+    ):
+        waiting = {pool.submit(add, path, options, beside): path for path in paths}
+        try:
+            for each in as_completed(waiting):
+                found.append((waiting[each], each.result()))
+                reach(len(found))
+        except BaseException as error:
+            pool.shutdown(cancel_futures=True)
+            if isinstance(error, KeyboardInterrupt):
+                done = f"stopped after {len(found)} of {len(paths)} recordings"
+                raise RecordingError(f"{done}: run it again for the others") from None
+            raise
+    return found
 
 
 def run(options: argparse.Namespace) -> int:
@@ -137,25 +161,15 @@ def run(options: argparse.Namespace) -> int:
         read_tool(options.tool)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        # Of this process: Ctrl-C kills those that work for it.
+        unfinished = tempfile.TemporaryDirectory(
+            prefix=".unfinished-", dir=folder, ignore_cleanup_errors=True
+        )
     except OSError as error:
-        raise FileError(f"{folder} cannot be made: {error.strerror or error}") from None
-    paths, found = options.recordings, list[tuple[Path, Done]]()
-    workers = min(os.cpu_count() or 1, len(paths))
-    if workers < 2:
-        found = [(path, add(path, options)) for path in paths]
-    else:
-        with (
-            progress(f"{len(paths)} recordings", len(paths)) as reach,
-            ProcessPoolExecutor(workers, get_context("spawn"), switch_off) as pool,
-        ):
-            waiting = {pool.submit(add, path, options): path for path in paths}
-            try:
-                for each in as_completed(waiting):
-                    found.append((waiting[each], each.result()))
-                    reach(len(found))
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+        raise FileError(f"{folder} cannot be written: {error.strerror or error}") from None
+    with unfinished as beside:
+        found = _add_all(options.recordings, options, beside)
+    paths = options.recordings
     bad = [done.why for path, done in sorted(found) if done.why]
     unchanged = sum(done.is_unchanged for _, done in found)
     rows = count(sum(done.rows for _, done in found), "row")

@@ -64,7 +64,7 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     if not there or options.sensor not in {None, *there}:
         which = "" if options.sensor is None else f" of sensor {options.sensor}"
         raise RecordingError(f"{recording.path} has no samples{which}")
-    rows, axis, first_ns, new = 0, TimeAxis(), -1, NewSamples()
+    rows, strays, axis, first_ns, new = 0, 0, TimeAxis(), -1, NewSamples()
     with NewFile(options.output, force=options.force) as file:
         file.write(",".join(COLUMNS) + "\n")
         tables = recording.tables(options.sensor, is_whole=True)
@@ -81,11 +81,17 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
                 first_ns = int(moments[moments > moments[0] - _SECOND].min())
             places, flags = axis.places(found.monotonic_ns, found.stamp_ns), flags[is_kept]
             held = recording.asked.holds(found.stamp_ns, places - first_ns)
+            is_later = np.ones(len(kept), bool)
+            for sensor in () if options.all else np.unique(kept["sensor"]).tolist():
+                own = kept["sensor"] == sensor
+                is_later[own] = axis.is_later(places[own], sensor)
+            strays, held = strays + int((held & ~is_later).sum()), held & is_later
             written = _lines(kept[held], found.where(held), flags[held], places[held], first_ns)
             file.write("".join(written))
             rows += int(held.sum())
         file.finish()
-    left_out = (sum(there.values()) if options.sensor is None else there[options.sensor]) - rows
+    frames = sum(there.values()) if options.sensor is None else there[options.sensor]
+    left_out = frames - rows - strays
     left = f"; {count(left_out, 'frame')} without a new sample left out" if left_out > 0 else ""
     return "; ".join([f"{count(rows, 'sample')}{left}", *axis.said])
 

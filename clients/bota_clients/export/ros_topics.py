@@ -22,6 +22,7 @@ from bota_clients.export.samples import MOST_LOST, in_part, samples_of
 from bota_clients.export.windows import Arrays
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
+from bota_clients.recording.order import TimeAxis
 from bota_clients.recording.reader import Recording
 from bota_clients.recording.writer import whole_file
 from bota_ethercat.program.version import VERSION
@@ -82,19 +83,20 @@ _NUMBERS: Final = {_WRENCH: 6, _IMU: 37}  # float64 at the end; of others 2
 
 def write(options: argparse.Namespace, recording: Recording) -> str:
     """The topics of a sensor into a file; says how many messages. RecordingError."""
-    sensor = choose(recording, options.sensor)
+    sensor, axis = choose(recording, options.sensor), TimeAxis()
     windows = windows_for(options, recording, sensor, MOST_LOST)
     with whole_file(options.output, force=options.force) as disk:
         writer: Any = Writer(cast("IO[Any]", disk), compression=CompressionType.ZSTD)
         writer.start("ros2", f"{PROGRAM} {VERSION}")
         wanted = [topic for topic in TOPICS if windows.stream or not topic.valid]
         senders, sent = [_Sender(writer, topic) for topic in wanted], 0
-        for block in in_part(recording, windows, samples_of(recording, windows, sensor.sensor)):
+        for block in in_part(recording, windows, samples_of(recording, windows, sensor.sensor, axis)):
             sent += sum(each.send(block) for each in senders)
             disk.flush()
         writer.finish()
         disk.flush()
-    return f"{count(sent, 'message')} on {', '.join(topic.name for topic in wanted)}"
+        disk.sync()
+    return "; ".join([f"{count(sent, 'message')} on {', '.join(topic.name for topic in wanted)}", *axis.said])
 
 
 class _Sender:

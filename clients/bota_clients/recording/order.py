@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bota_clients.numbers import count
-from bota_clients.recording.columns import Columns, Ints
+from bota_clients.recording.columns import Bools, Columns, Ints
 from bota_ethercat.stream.timeline import InForce
 
 _SECOND: Final = 1_000_000_000
@@ -56,7 +56,7 @@ class TimeAxis:
     def __init__(self) -> None:
         self.restarts = self.left_out = self.shift_ns = self._stamp_ns = 0
         self._last_ns = self._before_ns = -1  # of the latest frame, and of the one before
-        self._newest_ns = -1
+        self._newest_ns = dict[int, int]()  # of each sensor's samples
         self._undo: tuple[int, int] | None = None  # what was before a restart, which may be a stray stamp
 
     def places(self, monotonic_ns: Ints, stamp_ns: Ints) -> Ints:
@@ -84,15 +84,20 @@ class TimeAxis:
             self._stamp_ns = int(stamps[-1])
         return np.minimum(monotonic_ns, _MAX - shifts) + shifts
 
+    def is_later(self, places: Ints, sensor: int = 0) -> Bools:
+        """(n,) Which of a sensor's next samples, at these places, come in order; counts the others."""
+        newest_ns = self._newest_ns.get(sensor, -1)
+        found = in_order(np.append(newest_ns, places))[1:] & (places > newest_ns)
+        self._newest_ns[sensor] = int(places[found].max(initial=newest_ns))
+        self.left_out += int((~found).sum())
+        return found
+
     def batches(self, batches: Iterable[tuple[InForce, Columns]]) -> Iterator[tuple[InForce, Columns]]:
         """Those of one sensor with their places as `monotonic_ns`, without samples out of order."""
         for in_force, batch in batches:
             places, is_kept = self.places(batch.monotonic_ns, batch.stamp_ns), np.ones(len(batch), bool)
-            found, new = replace(batch, monotonic_ns=places), places[batch.fresh]
-            is_later = in_order(np.append(self._newest_ns, new))[1:] & (new > self._newest_ns)
-            self._newest_ns = int(new[is_later].max(initial=self._newest_ns))
-            if strays := int((~is_later).sum()):
-                self.left_out += strays
+            found, is_later = replace(batch, monotonic_ns=places), self.is_later(places[batch.fresh])
+            if not is_later.all():
                 is_kept[batch.fresh] = is_later
                 found = found.where(is_kept)
             if len(found):

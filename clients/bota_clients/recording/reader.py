@@ -174,7 +174,7 @@ class Recording(McapFile):
         if self.asked.part:
             self.sensors = tuple(map(self._in_part, self.sensors))
         self.frame_count = sum(each.frames for each in self.sensors)
-        if self.asked.part and not self.frame_count:
+        if self.asked.part and not self.frame_count and any(counts.values()):
             stamps = [item["stamp_ns"] for item in self._tables(None) if isinstance(item, np.ndarray)]
             begin_ns, end_ns = (int(stamps[row][row]) if stamps else 0 for row in (0, -1))
             long = f"it is {seconds((end_ns - begin_ns) * 1e-9)} long, from {moment(begin_ns)} on"

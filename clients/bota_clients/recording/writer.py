@@ -59,9 +59,13 @@ class DiskFile:
         removed: whether the file had no name any more when it was flushed last.
     """
 
-    def __init__(self, path: Path, *, overwrite: bool) -> None:
-        """Create the file; RecordingError if that fails, or if it exists and `overwrite` is False."""
-        self.path = path
+    def __init__(self, path: Path, *, overwrite: bool, becomes: Path | None = None) -> None:
+        """Create the file; RecordingError if that fails, or if it exists and `overwrite` is False.
+
+        `becomes`: what it is renamed to once it is complete; nothing is left of it before.
+        """
+        self.path = becomes or path
+        self._left = "" if becomes else "; what was written before is intact"
         self.removed = False
         self._waiting: list[bytes] = []
         self._position = self._written = 0  # with and without what is buffered
@@ -96,7 +100,7 @@ class DiskFile:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._fd, self._written)
             self._position = self._written
-            raise self._failed(error, "; what was written before is intact") from None
+            raise self._failed(error, self._left) from None
         self._written = self._position
         self.removed = self._counts_links and os.fstat(self._fd).st_nlink == 0
         if self.removed:
@@ -122,15 +126,21 @@ class DiskFile:
 
 @contextlib.contextmanager
 def whole_file(path: Path, *, force: bool) -> Iterator[DiskFile]:
-    """A file that is there once it is complete; FileError if it exists and `force` is False."""
+    """A file that is there once it is complete, as `NewFile`; a device is written directly. FileError."""
     refuse_existing(path, force=force)
-    with tempfile.TemporaryDirectory(
-        prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
-    ) as folder:
-        made = Path(folder, path.name)
-        with contextlib.closing(DiskFile(made, overwrite=False)) as disk:
+    if path.exists() and not path.is_file():
+        with contextlib.closing(DiskFile(path, overwrite=True)) as disk:
             yield disk
-        made.replace(path)
+        return
+    target = Path(os.path.realpath(path))  # a symbolic link stays one
+    with tempfile.TemporaryDirectory(
+        prefix=".unfinished-", dir=target.parent, ignore_cleanup_errors=True
+    ) as folder:
+        made = Path(folder, target.name)
+        with contextlib.closing(DiskFile(made, overwrite=False, becomes=path)) as disk:
+            yield disk
+        refuse_existing(path, force=force)
+        made.replace(target)
 
 
 class _Index(list[Any]):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What SIGINT and SIGTERM do once a program is loaded; before, `start` has them end it at once.
+"""What the signals that ask a program to end do once it is loaded; before, `start` has them end it at once.
 
 Either they are remembered (`Signals`), by programs that have something to finish, or they raise
 KeyboardInterrupt (`interrupt_on_signals`), but within `signals_held_back` and `signals_call`.
@@ -13,8 +13,17 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 
+def asking() -> list[signal.Signals]:
+    """SIGINT, SIGTERM and, of a terminal or SSH connection that is gone, SIGHUP, which nohup ignores."""
+    found = [signal.SIGINT, signal.SIGTERM]
+    # Windows lacks it.
+    if (hang_up := getattr(signal, "SIGHUP", None)) and signal.getsignal(hang_up) is not signal.SIG_IGN:
+        found.append(hang_up)
+    return found
+
+
 class Signals:
-    """SIGINT, SIGTERM and, unless it is ignored as by nohup, SIGHUP: they ask the program to end.
+    """The signals that ask the program to end.
 
     Attributes:
         asked: whether one has arrived; set it to stop without one.
@@ -23,10 +32,8 @@ class Signals:
     def __init__(self) -> None:
         self.asked = False
         self._stop: Callable[[], object] = lambda: None
-        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-            number = getattr(signal, name, None)  # Windows lacks the last one
-            if number and not (name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN):
-                signal.signal(number, self._on_signal)
+        for number in asking():
+            signal.signal(number, self._on_signal)
         _unblock()
 
     def call(self, stop: Callable[[], object]) -> None:
@@ -41,16 +48,16 @@ class Signals:
 
 
 def interrupt_on_signals() -> None:
-    """SIGINT and SIGTERM raise KeyboardInterrupt: for when everything is imported."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    """They raise KeyboardInterrupt: for when everything is imported."""
+    for number in asking():
         signal.signal(number, signal.default_int_handler)
     _unblock()
 
 
 @contextlib.contextmanager
 def signals_held_back() -> Iterator[None]:
-    """Defer SIGINT and SIGTERM during a change."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    """Defer them during a change."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, asking())
     try:
         yield
     finally:
@@ -59,9 +66,8 @@ def signals_held_back() -> Iterator[None]:
 
 @contextlib.contextmanager
 def signals_call(handle: Callable[[], None]) -> Iterator[None]:
-    """SIGINT and SIGTERM only call `handle`."""
-    numbers = signal.SIGINT, signal.SIGTERM
-    before = {number: signal.signal(number, lambda *_: handle()) for number in numbers}
+    """They only call `handle`."""
+    before = {number: signal.signal(number, lambda *_: handle()) for number in asking()}
     try:
         yield
     finally:
@@ -72,4 +78,4 @@ def signals_call(handle: Callable[[], None]) -> Iterator[None]:
 def _unblock() -> None:
     """The program that started this one may have had them blocked, which is inherited."""
     if hasattr(signal, "pthread_sigmask"):  # not on Windows
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, asking())

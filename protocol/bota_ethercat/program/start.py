@@ -21,9 +21,6 @@ INTERRUPTED = 130  # Exit code after Ctrl-C, as shells have it
 def run(module: str) -> int:
     """The exit code of `main` of this module, which handles Ctrl-C itself once it can."""
     open_streams()
-    for stream in (sys.stdout, sys.stderr):  # its encoding may lack characters
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
     try:
         code: int = import_module(module).main()
     except KeyboardInterrupt:
@@ -34,7 +31,10 @@ def run(module: str) -> int:
 
 
 def open_streams() -> None:
-    """Have nothing on closed standard streams; else files and sockets would get their descriptors."""
+    """Have nothing on closed standard streams; else files and sockets would get their descriptors.
+
+    What the encoding of an open one lacks is escaped.
+    """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             opened = os.open(os.devnull, os.O_RDWR)  # the lowest that is free
@@ -44,3 +44,6 @@ def open_streams() -> None:
             os.set_inheritable(number, True)
             stream = open(number, "w" if number else "r", encoding="utf-8", closefd=False)  # noqa: SIM115
             setattr(sys, name, stream)
+    for output in (sys.stdout, sys.stderr):
+        if isinstance(output, io.TextIOWrapper):
+            output.reconfigure(errors="backslashreplace")
