@@ -9,7 +9,6 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 from bota_clients.arguments import add_imu_units, duration
-from bota_clients.errors import RecordingError
 from bota_ethercat.program.arguments import number, typed
 from bota_ethercat.sensor.response import delays_ms
 from bota_ethercat.settings import SettingValue, parse_assignment, sampling_rate_hz
@@ -47,11 +46,8 @@ class Asked(NamedTuple):
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> Self:
-        """Of `add_reading`; RecordingError if no row can be of it."""
-        begin, end = options.begin, options.end
-        if begin and end and begin.is_stamp == end.is_stamp and begin.ns >= end.ns:
-            raise RecordingError(f"--from {begin.text} is not before --to {end.text}")
-        return cls(begin, end, options.rate, dict(options.assignments))
+        """Of `add_reading`."""
+        return cls(options.begin, options.end, options.rate, dict(options.assignments))
 
     @property
     def part(self) -> str:
@@ -79,13 +75,37 @@ class Asked(NamedTuple):
         return {"sensors": [{"sensor": sensor, **row} for sensor in sensors]}
 
 
+class _Ends(argparse.Action):
+    def __call__(
+        self, parser: argparse.ArgumentParser, options: argparse.Namespace, at: Any, *_: object
+    ) -> None:
+        setattr(options, self.dest, at)
+        begin, end = options.begin, options.end
+        if begin and end and begin.is_stamp == end.is_stamp and begin.ns >= end.ns:
+            parser.error(f"--from {begin.text} is not before --to {end.text}")
+
+
 def add_reading(parser: argparse.ArgumentParser) -> None:
     """How a recording is read: its units, a part of it, what it does not say; see `Asked.of`."""
     add_imu_units(parser)
     add = parser.add_argument
     what = "seconds from the start (30, 5min), or a time (2026-11-29T12:00:05Z)"
-    add("--from", dest="begin", type=typed(Moment.parse, what), metavar="TIME", help=f"from there on: {what}")
-    add("--to", dest="end", type=typed(Moment.parse, what), metavar="TIME", help="until before it")
+    add(
+        "--from",
+        dest="begin",
+        action=_Ends,
+        type=typed(Moment.parse, what),
+        metavar="TIME",
+        help=f"from there on: {what}",
+    )
+    add(
+        "--to",
+        dest="end",
+        action=_Ends,
+        type=typed(Moment.parse, what),
+        metavar="TIME",
+        help="until before it",
+    )
     add("--rate", type=number(1e-3, 1e6), default=0.0, metavar="HZ",
         help="the sampling rate, if another program has left it out of the recording")  # fmt: skip
     add("--set", type=typed(parse_assignment), action="append", default=[], metavar="NAME=VALUE",
