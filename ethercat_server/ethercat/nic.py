@@ -446,12 +446,13 @@ def _destination(family: int, length: int, route: dict[int, bytes]) -> str:
 
 
 def _carried_by(index: int) -> set[int]:
-    """The interface, and those that stand on it, such as VLANs."""
+    """The interface, and those that stand on it, such as VLANs, and the bridge that it is a part of."""
     rows, carried = interfaces(), {index}
     for _ in rows:
         carried |= {
             row.ifindex for row in rows if row.link in carried and not row.namespace and row.kind != "veth"
         }
+        carried |= {row.master_index for row in rows if row.ifindex in carried and row.master_index}
     return carried
 
 

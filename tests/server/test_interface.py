@@ -483,8 +483,12 @@ def test_what_stands_on_what_stands_on_an_interface_is_carried_by_it(monkeypatch
     rows = [replace(SEES, ifindex=index, link=link, kind="vlan") for index, link in sorted(links.items())]
     rows[1] = replace(rows[1], kind="veth")
     rows[0] = replace(rows[0], namespace=1)
+    rows.insert(0, nic.Interface("br0", 2, kind="bridge"))
     monkeypatch.setattr(nic, "interfaces", lambda: rows)
     assert nic._carried_by(5) == {5, 9, 8, 7}
+    rows[-1] = replace(rows[-1], master_index=2)
+    assert nic._carried_by(5) == {5, 9, 8, 7, 2}
+    assert nic._carried_by(2) == {2}
 
 
 def test_no_service_is_installed_for_one() -> None:
