@@ -482,7 +482,7 @@ def test_what_stands_on_what_stands_on_an_interface_is_carried_by_it(monkeypatch
     links = {5: 0, 9: 5, 8: 9, 7: 8, 6: 3, 4: 5, 3: 8}
     rows = [replace(SEES, ifindex=index, link=link, kind="vlan") for index, link in sorted(links.items())]
     rows[1] = replace(rows[1], kind="veth")
-    rows[0] = replace(rows[0], namespace=1)
+    rows[0] = replace(rows[0], namespace=b"1")
     rows.insert(0, nic.Interface("br0", 2, kind="bridge"))
     monkeypatch.setattr(nic, "interfaces", lambda: rows)
     assert nic._carried_by(5) == {5, 9, 8, 7}
