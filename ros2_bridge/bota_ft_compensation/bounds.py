@@ -38,8 +38,11 @@ from bota_ft_compensation.quantities import (
 _OF_FORCE, _OF_TORQUE = 7.815 / 3.0, 2.8
 _TYPED: Final = 0.1  # of its largest element: half of the interval of a tensor that is given without one
 # Of an IMU that is not identified: how far from its place, m, and how wrong its angular acceleration is; of
-# any, what alignment leaves of that.
-_OFF_PLACE, _SPIN, _ALIGNED = 1.3e-3, 0.0075, 0.006
+# any, what alignment leaves of that where FIR is off.
+_OFF_PLACE, _SPIN, _ALIGNED = 1.3e-3, 0.013, 0.006
+_ALONE: Final = (
+    1.15  # chi squared of two axes by that of three: what is unknown of tool and IMU pushes along two
+)
 _REFERENCE_SINC: Final = 51
 _NO_TARE: Final = TareBasis()
 
@@ -89,7 +92,7 @@ class Bounds:
         is_tared = taken.specific_force != ZERO
         self._from = taken.specific_force if is_tared else ZERO
         is_same = is_tared and taken.accelerometer == accelerometer
-        wrong = _ALIGNED**2
+        wrong = 0.0 if alignment.settings.get("fir") else _ALIGNED**2
         if any(accuracy.left):
             force, torque = ([3.0 * each * each for each in part] for part in _halved(accuracy.left))
             self.unknown = (0.0, 0.0) if is_same else (force[0], torque[0])
@@ -104,12 +107,16 @@ class Bounds:
             felts = [x + yx + zx, y + xy + zy, z + xz + yz]
             centers = [weight * half * half for half in center_halves]
             self.unknown = offset, at_arm * offset
-            self.by_felt = felts, [sum(centers) - c + at_arm * f for c, f in zip(centers, felts, strict=True)]
-            off = 2.0 * by_imu * (mass * _OFF_PLACE) ** 2
+            centers = [_ALONE * (sum(centers) - each) for each in centers]
+            self.by_felt = felts, [c + at_arm * f for c, f in zip(centers, felts, strict=True)]
+            wrong *= _ALONE
+            off = [by_imu * (2.0 * _ALONE * (mass * _OFF_PLACE) ** 2 + each) for each in centers]
             halves = _matrix([(each / NORMAL_95) ** 2 for each in inertia_halves(payload)])
-            self.by_spin = [off] * 3, [sum(row) + at_arm * off for row in halves]
+            self.by_spin = off, [sum(row) + at_arm * each for row, each in zip(halves, off, strict=True)]
         for row, whole in zip(self.by_spin, (forces, torques), strict=True):
             row[:] = (a + by_imu * wrong * b for a, b in zip(row, whole, strict=True))
+        # What of the squares of a rest is noise of the gyroscope.
+        self._still = -spin * sum(self.by_spin[0]), -spin * sum(self.by_spin[1])
 
     def at(self, felt: Any = UPRIGHT, turning: Turning = STILL) -> tuple[Any, Any]:
         """N and Nm, of a sample that felt this specific force at the center of gravity, m/s², and turned so.
@@ -127,8 +134,10 @@ class Bounds:
         ax, ay, az = ax * ax + quarter * wx, ay * ay + quarter * wy, az * az + quarter * wz
         (fx, fy, fz), (tx, ty, tz) = self.by_felt
         (px, py, pz), (qx, qy, qz) = self.by_spin
-        force = self._fixed[0] + self.unknown[0] + fx * x + fy * y + fz * z + px * ax + py * ay + pz * az
-        torque = self._fixed[1] + self.unknown[1] + tx * x + ty * y + tz * z + qx * ax + qy * ay + qz * az
+        p = self._still[0] + px * ax + py * ay + pz * az
+        q = self._still[1] + qx * ax + qy * ay + qz * az
+        force = self._fixed[0] + self.unknown[0] + fx * x + fy * y + fz * z + 0.5 * (p + abs(p))
+        torque = self._fixed[1] + self.unknown[1] + tx * x + ty * y + tz * z + 0.5 * (q + abs(q))
         return (_OF_FORCE * force) ** 0.5, (_OF_TORQUE * torque) ** 0.5
 
     def of_tool(self) -> tuple[float, float, float]:

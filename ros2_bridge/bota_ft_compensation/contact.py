@@ -12,10 +12,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 from bota_ethercat.pdo import Vector3
-from bota_ethercat.sensor.response import fir_taps, imu_noise
+from bota_ethercat.sensor.response import imu_noise, noise_taps
 from bota_ethercat.settings import SettingValue
 from bota_ft_compensation.bounds import Bounds
 from bota_ft_compensation.quantities import (
@@ -31,7 +32,6 @@ FARTHEST_M: Final = 10.0  # from the sensor: what a parameter may name
 # Chi squared that 95 % keep to, with 6 and with 2 degrees of freedom, and the root of that with 3.
 _RELEASE, _REGION, _CHI_3 = 12.592, 5.991, 2.795
 _IMU_MOTION: Final = 0.12  # m/s² on each axis: deviation of what alignment leaves of motion, by its extremes
-_SINC: Final = (66.0, 26.0, 1.0)  # autocorrelation of the third-order sinc filter, from lag 0
 
 
 class Why(Enum):
@@ -130,10 +130,7 @@ def detector_of(
 
 def correlation(settings: Mapping[str, SettingValue]) -> float:
     """Of the noise of one sample and the next, by the sensor's filters."""
-    taps = list(enumerate(fir_taps() if settings.get("fir") else (1.0,)))
-    pairs = [(i - j, a * b) for i, a in taps for j, b in taps]
-    zero, one = (sum(p * _SINC[abs(lag + by)] for lag, p in pairs if abs(lag + by) < 3) for by in (0, 1))
-    return one / zero
+    return sum(a * b for a, b in pairwise(noise_taps(settings)))
 
 
 def _level(share: Callable[[float], float], alarms_per_sample: float, correlation: float) -> float:

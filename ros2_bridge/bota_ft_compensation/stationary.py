@@ -27,6 +27,7 @@ from bota_ft_compensation.quantities import (
 
 _MOST_SAMPLES: Final = 200_000
 _BLOCKS: Final = 4
+_ALIKE: Final = 25  # samples: as many last the filters of force and torque
 CHANCE: Final = 5.0  # standard errors: means of noise rarely differ by more
 _NO_LIMIT: Final = 1e-12
 _NAMES: Final = ("force", "torque", "acceleration", "angular rate")
@@ -49,6 +50,8 @@ class StationaryMeans(NamedTuple):
     acceleration_spread: Vector3 = ZERO  # m/s²
     time_s: float | None = None  # of its middle, by the samples' clock
     latest: Wrench = NO_WRENCH  # N, Nm: the mean of the last quarter
+    # Variance of means of force and torque, against that of as many samples that filters do not make alike.
+    alike: float = 1.0
 
 
 class StationaryWindow:
@@ -126,7 +129,12 @@ def stationary_means(rows: Array, limits: StationaryLimits) -> StationaryMeans:
     f, t, a = (triple(mean[first : first + 3]) for first in (0, 3, 6))
     of_force, of_torque, of_acceleration = (triple(spread[first : first + 3]) for first in (0, 3, 6))
     latest = Wrench.of(rows[-len(rows) // _BLOCKS :, :6].mean(axis=0))
-    return StationaryMeans(Wrench(f, t), a, of_force, of_torque, len(rows), of_acceleration, latest=latest)
+    noise = (rows[:, :6] - mean[:6]) / (spread[:6] + _NO_LIMIT)
+    pairs = [float((noise[by:] * noise[:-by]).sum()) for by in range(1, min(_ALIKE, len(rows)))]
+    alike = max(1.0, 1.0 + 2.0 * sum(pairs) / noise.size)
+    return StationaryMeans(
+        Wrench(f, t), a, of_force, of_torque, len(rows), of_acceleration, latest=latest, alike=alike
+    )
 
 
 def _check(values: Array, limits: tuple[float, ...], shown: Array, how: str) -> None:

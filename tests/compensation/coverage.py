@@ -1,6 +1,6 @@
 """How often what is said of an error holds: of intervals, bounds, refusals and alarms, by case; seeded.
 
-    .venv/bin/python -m tests.compensation.coverage intervals|bounds|contact [RUNS] [CASE ...]
+    .venv/bin/python -m tests.compensation.coverage intervals|bounds|contact [RUNS] [CASE|SINC|FIR ...]
 
 Rigid bodies in analytic motion, through the sensor's filters (`motion`), and a real IMU: its errors are drawn
 anew for every run, with the standard deviations of `imu_of`.
@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path as File
 from types import SimpleNamespace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 
@@ -34,7 +35,7 @@ from bota_ft_compensation.identification.parameter_file import stream_of, write_
 from bota_ft_compensation.identification.payload import Identified, TooVagueError, identify
 from bota_ft_compensation.identification.poses import Pose, pose_of
 from bota_ft_compensation.imu import ImuSource
-from bota_ft_compensation.quantities import EXACT, NO_WRENCH, CompensationError, Payload
+from bota_ft_compensation.quantities import EXACT, NO_WRENCH, NORMAL_95, CompensationError, Payload
 from bota_ft_compensation.stationary import stationary_means
 from bota_ft_compensation.stream import CompensatedStream
 from tests.compensation import motion
@@ -54,10 +55,11 @@ class Case(NamedTuple):
     noise: float = 1.0
     sinc_length: int = 64
     touch_n: float = 0.0
+    fir: bool = False
 
     @property
     def settings(self) -> dict[str, Any]:
-        return settings(self.sinc_length)
+        return settings(self.sinc_length, self.fir)
 
     @property
     def rate_hz(self) -> float:
@@ -119,15 +121,14 @@ def true_calibration(imu: Imperfection) -> tuple[Array, Array, Array]:
 
 
 def noise_of(case: Case) -> Array:
-    ratio = np.divide(healthy_noise(case.sinc_length), healthy_noise(64))
+    ratio = np.divide(healthy_noise(case.sinc_length, fir=case.fir), healthy_noise(64))
     return np.asarray(np.repeat([FORCE_NOISE, TORQUE_NOISE], 3) * ratio * case.noise)
 
 
 def with_noise(felt: Felt, case: Case, seed: int) -> Felt:
-    draw, noise = np.random.default_rng([seed, 12]), noise_of(case)
+    noise = noise_of(case) * motion.noise_like(case.settings, (len(felt.times), 6), [seed, 12])
     return felt._replace(
-        force=felt.force + BIAS.force + draw.normal(0.0, noise[:3], felt.force.shape),
-        torque=felt.torque + BIAS.torque + draw.normal(0.0, noise[3:], felt.torque.shape),
+        force=felt.force + BIAS.force + noise[:, :3], torque=felt.torque + BIAS.torque + noise[:, 3:]
     )
 
 
@@ -142,8 +143,9 @@ def held(up: Sequence[float], tool: Payload, case: Case, imu: Imperfection, seed
     felt = STANDARD_GRAVITY * direction / np.linalg.norm(direction)
     (offset, matrix), force = read_as(imu), -tool.mass * felt
     mean = [*force + BIAS.force, *np.cross(tool.center, force) + BIAS.torque, *matrix @ felt + offset]
-    noise = [*noise_of(case), *[imu.acceleration_noise] * 3, *[imu.rate_noise] * 3]
-    return np.array([*mean, *[imu.rate_offset] * 3]) + draw.normal(0.0, noise, (count, 12))
+    of_imu = draw.normal(0.0, [imu.acceleration_noise] * 3 + [imu.rate_noise] * 3, (count, 6))
+    noise = noise_of(case) * motion.noise_like(case.settings, (count, 6), draw)
+    return np.array([*mean, *[imu.rate_offset] * 3]) + np.hstack([noise, of_imu])
 
 
 def poses_of(tool: Payload, case: Case, imu: Imperfection, seed: int) -> list[Pose]:
@@ -249,6 +251,14 @@ KINDS: Final = ("typed, tared", "tensor typed, tared", "poses", "poses and motio
                 "free motion, tared", "free motion")  # fmt: skip
 
 
+def typed(tool: Payload, seed: int, *, has_tensor: bool) -> Payload:
+    """As somebody knows it who is about as wrong as is assumed."""
+    draw = np.random.default_rng([seed, 15])
+    x, y, z = (tool.center + draw.normal(0.0, Payload().center_interval) / NORMAL_95).tolist()
+    inertia = tool.inertia + draw.normal(0.0, 0.1 / NORMAL_95 * max(tool.inertia), 6)
+    return Payload(tool.mass, (x, y, z), tuple(inertia.tolist()) if has_tensor else (0.0,) * 6)
+
+
 @functools.lru_cache(maxsize=100)
 def stream_for(kind: str, case: Case, seed: int) -> CompensatedStream:
     """As it is started with a file; CompensationError."""
@@ -256,8 +266,7 @@ def stream_for(kind: str, case: Case, seed: int) -> CompensatedStream:
     with tempfile.TemporaryDirectory() as folder:
         file = File(folder) / "tool.yaml"
         if "typed" in kind:
-            inertia = tool.inertia if "tensor" in kind else (0.0,) * 6
-            write_payload(file, Payload(tool.mass, tool.center, inertia))
+            write_payload(file, typed(tool, seed, has_tensor="tensor" in kind))
         else:
             name = kind.removesuffix(", tared")
             poses, seconds = {"poses": (6, 0.0), "poses and motion": (6, 20.0), "free motion": (0, 20.0)}[
@@ -315,23 +324,31 @@ def alarms(kind: str, name: str, case: Case, minutes: int, first: int = 0) -> in
     for seed in range(first, first + minutes):
         stream = stream_for(kind, case, seed)
         felt = felt_in(MOTIONS[name](seed + 500), tool_of(seed), 61.0, case, imu_of(seed, case), seed + 700)
-        detector = stream.contact_detector(Plane((0.0, 0.0, 0.1), (0.0, 0.0, 1.0), 0.05))
-        source, was = stream.plan.source, False
-        assert isinstance(source, ImuSource)
-        source.configure(stream.in_force)
-        for time_s, force, torque, read, rate in zip(*(part.tolist() for part in felt), strict=True):
-            if (at := source.follow(read, rate, time_s)) is None:
-                continue  # the first few
-            final = stream.stages(SimpleNamespace(force=force, torque=torque), time_s, at).final
-            now = detector.update(final.force, final.torque, source.turning)
-            count += now and not was and time_s > 1.0
-            was = now
+        count += contacts(stream, felt)
     return count
+
+
+def contacts(stream: CompensatedStream, felt: Felt) -> int:
+    """How often contact begins, after a second."""
+    detector = stream.contact_detector(Plane((0.0, 0.0, 0.1), (0.0, 0.0, 1.0), 0.05))
+    source, rows = stream.plan.source, []
+    assert isinstance(source, ImuSource)
+    source.configure(stream.in_force)
+    for time_s, _, _, read, rate in zip(*(part.tolist() for part in felt), strict=True):
+        at = source.follow(read, rate, time_s)
+        rows.append((at or (math.nan,) * 3, *source.turning))
+    at, *turning = cast(Any, np.moveaxis(np.array(rows), 0, 2))
+    columns = SimpleNamespace(force=felt.force.T, torque=felt.torque.T)
+    final, is_beyond = stream.stages(columns, 0.0, at, turning).final, []
+    for detector.is_contact in (False, True):  # of the limits of the beginning and of the end
+        is_beyond.append(cast(Any, detector.update(*final, turning)))
+    begins, lasts = is_beyond
+    return len(np.unique(np.cumsum(~lasts)[begins & (felt.times > 1.0)]))
 
 
 def main(what: str, runs: int, names: Sequence[str]) -> None:
     sizes = [int(name) for name in names if name.isdigit()] or [64]
-    names = [name for name in names if not name.isdigit()]
+    names, firs = [name for name in names if not name.isdigit() and name != "FIR"], ["FIR" in names]
     if what == "intervals":
         for name in (name for name in CASES if name in names or not names):
             shares, refused, noted = intervals(CASES[name], runs)
@@ -343,9 +360,9 @@ def main(what: str, runs: int, names: Sequence[str]) -> None:
             sys.stdout.write(f"{name:24}{told}; refused {len(refused)}, touch named {touched} of {runs}\n")
             sys.stdout.flush()
         return
-    for kind, size, name in itertools.product(KINDS, sizes, MOTIONS):
+    for kind, size, fir, name in itertools.product(KINDS, sizes, firs, MOTIONS):
         if {kind, name} & {*names} or not names:
-            case = Case(sinc_length=size)
+            case = Case(sinc_length=size, fir=fir)
             if what == "contact":
                 told = f"{alarms(kind, name, case, runs)} alarms in {runs} minutes"
             else:

@@ -10,7 +10,7 @@ import pytest
 
 from bota_ethercat.client import Client
 from bota_ethercat.pdo import Vector3
-from bota_ethercat.sensor.response import fir_taps, healthy_noise, imu_noise
+from bota_ethercat.sensor.response import healthy_noise, imu_noise
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.world import Felt
 from bota_ft_compensation.alignment import align
@@ -169,14 +169,7 @@ def test_without_a_point_it_says_why(surface: Surface, wrench: tuple[Vector3, Ve
 
 def noise_of(settings: dict[str, SettingValue], count: int) -> Array:
     """(count, 6): white noise through the sensor's filters."""
-    draw, taps = np.random.default_rng([SEED, 92]), fir_taps() if settings["fir"] else (1.0,)
-    white = draw.normal(size=(4 * (count + 40), 6))
-    kernel = np.ones(1)
-    for _ in range(3):
-        kernel = np.convolve(kernel, np.ones(4))
-    fine = np.stack([np.convolve(column, kernel, "valid")[::4] for column in white.T], axis=1)
-    passed = np.stack([np.convolve(column, taps, "valid")[:count] for column in fine.T], axis=1)
-    return np.asarray(passed / passed.std(axis=0))
+    return motion.noise_like(settings, (count, 6), [SEED, 92])
 
 
 def alarms(contact: ContactDetector, rows: Array) -> int:

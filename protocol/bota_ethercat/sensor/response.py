@@ -33,6 +33,9 @@ _KAISER_BETA: Final = 8.8
 _NOISE_SINC: Final = 51
 _NOISE: Final = (*((0.3, 0.62),) * 3, (0.007, 0.78), (0.007, 0.78), (0.0025, 0.78))
 _GYROSCOPE_NOISE_DENSITY_DPS_RTHZ: Final = 0.01  # MPU-9250's data sheet; Bota gives the accelerometer's only
+# Behind a third-order sinc filter neighboring samples of white noise are correlated as 66, 26 and 1: as if
+# each had these shares of the one before, in turn.
+_SINC_TAPS: Final = 0.4305753, 0.0430963
 _UNKNOWN: Final = (0.0, 0.0, 0.0)
 _IMU_FILTERS: Final = {"acceleration_filter": 1, "angular_rate_filter": 3}  # as sensors are delivered
 
@@ -138,6 +141,15 @@ def healthy_noise(sinc_length: int, *, fir: bool = False) -> tuple[float, ...]:
     """Standard deviations of force (N) and torque (Nm): a longer filter makes them quieter."""
     passed = math.hypot(*fir_taps()) if fir else 1.0
     return tuple(passed * deviation * (sinc_length / _NOISE_SINC) ** -power for deviation, power in _NOISE)
+
+
+def noise_taps(settings: Mapping[str, SettingValue]) -> tuple[float, ...]:
+    """What makes noise like that of force and torque of white noise; the sum of their squares is 1."""
+    taps = [*fir_taps()] if settings.get("fir") else [1.0]
+    for share in _SINC_TAPS:
+        taps = [tap + share * before for tap, before in zip([*taps, 0.0], [0.0, *taps], strict=True)]
+    size = math.hypot(*taps)
+    return tuple(tap / size for tap in taps)
 
 
 def noise_ratios(settings: Mapping[str, SettingValue]) -> tuple[float, ...]:

@@ -269,11 +269,11 @@ def _solved(turned: Turned, model: _Model, joint: Joint | None) -> _Answer:
 
 def _noise(turned: Turned, found: _Answer, payload: Payload) -> tuple[float, ...]:
     """Deviations of single samples, by what is left of smoothed ones: in which the IMU's noise is, too."""
-    squares = (found.left**2).mean(axis=0) * turned.noisier**2
+    squares = (found.left**2).mean(axis=0)
     by_imu = (payload.mass * turned.imu_noise) ** 2
     x, y, z = (part * part for part in payload.center)
     arms = np.array([1.0, 1.0, 1.0, y + z, x + z, x + y])
-    return tuple(np.sqrt(np.maximum(squares - by_imu * arms, 0.1 * squares)).tolist())
+    return tuple((turned.noisier * np.sqrt(np.maximum(squares - by_imu * arms, 0.1 * squares))).tolist())
 
 
 def _left(found: _Answer, imu: Vector3, bias: slice) -> Six:

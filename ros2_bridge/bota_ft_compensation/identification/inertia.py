@@ -15,7 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bota_ethercat.pdo import Vector3
-from bota_ethercat.sensor.response import acceleration_response, angular_rate_response, fir_taps, imu_noise
+from bota_ethercat.sensor.response import (
+    acceleration_response,
+    angular_rate_response,
+    fir_taps,
+    imu_noise,
+    noise_taps,
+)
 from bota_ft_compensation.alignment import Alignment, Array
 from bota_ft_compensation.identification.resampling import (
     at_times,
@@ -52,8 +58,8 @@ class Turned(NamedTuple):
     arm: Array  # (n, 3, 3): times a place in the sensor's frame, m: by how much it is another there
     spun: Array  # (n, 3, 6): times the tensor: J alpha + omega x J omega
     times: Array  # (n,) s; none where a sample is missing
-    # Deviations of force and torque, of single samples by those of smoothed ones, and what of a sample's
-    # acceleration, m/s², is noise.
+    # Deviations of noise: of force and torque, of single samples by those of smoothed ones, and of the
+    # acceleration of smoothed ones, m/s².
     noisier: float = 1.0
     imu_noise: float = 0.0
 
@@ -102,7 +108,8 @@ def turn(
     times = np.concatenate(instants)
     return Turned(
         force, torque, felt, arm.reshape(-1, 3, 3), spun.reshape(-1, 3, 6), times,
-        1.0 / float(np.linalg.norm(window)), imu_noise(settings)[0] * float(np.linalg.norm(taps)),
+        1.0 / float(np.linalg.norm(np.convolve(window, noise_taps(settings)))),
+        imu_noise(settings)[0] * float(np.linalg.norm(np.convolve(window, taps))),
     )  # fmt: skip
 
 

@@ -233,7 +233,7 @@ class _Equations:
             np.mean([length(pose.acceleration_spread) ** 2 / 3.0 / pose.samples for pose in poses])
         )
         self.spread = np.array([[*pose.force_spread, *pose.torque_spread] for pose in poses])
-        self._samples = np.array([[pose.samples] for pose in poses])
+        self._samples = np.array([[pose.samples / pose.alike] for pose in poses])
         times = [pose.time_s for pose in poses if pose.time_s is not None]
         # Minutes before the last pose; None if they say nothing.
         self.minutes: Array | None = None
@@ -461,7 +461,7 @@ def judge(poses: Sequence[Pose], residuals: Array, degrees: Array, name: str, we
     spread = np.array([getattr(pose, f"{name}_spread") for pose in poses])
     chi_square = None
     if spread.all():
-        expected = spread**2 / np.array([[pose.samples] for pose in poses])
+        expected = spread**2 / np.array([[pose.samples / pose.alike] for pose in poses])
         chi_square = float((residuals**2 / expected).sum()) / freedom
         if chi_square <= _rarely(freedom):
             return Fit(rms, freedom, chi_square, "noise")

@@ -38,6 +38,7 @@ class Pose(NamedTuple):
     )
     acceleration_spread: Vector3 = ZERO  # standard deviation of single samples, m/s²
     time_s: float | None = None  # when, by the clock of the other poses
+    alike: float = 1.0  # as `StationaryMeans.alike`
 
     @property
     def up(self) -> Vector3:
@@ -67,7 +68,7 @@ def pose_of(
         acceleration = None  # off, or broken
     return Pose(
         means.wrench, gravity, means.force_spread, means.torque_spread, means.samples,
-        acceleration, means.acceleration_spread, means.time_s,
+        acceleration, means.acceleration_spread, means.time_s, means.alike,
     )  # fmt: skip
 
 

@@ -98,7 +98,7 @@ struct Alignment {
         const auto turned = [&](bool slope) { return fitted(6.0, 8.0, 8, rate_noise, std::max(at_s - gyroscope_s, -kFurthest), count, slope); };
         lead = std::min(lead + std::max(1, static_cast<int>(std::ceil(0.004 * rate_hz))), count);
         taps = {lag_s ? fitted(10.0, 9.0, 3, acceleration_noise, std::max(at_s, -kFurthest), counted(0.014), false) : Taps{1.0}, turned(false), turned(true)};
-        felt_noise = acceleration_noise * norm(taps[0]), spin_noise = rate_noise * norm(taps[2]);
+        felt_noise = acceleration_noise * norm(taps[0]), spin_noise = rate_noise * norm(taps[2]), spin_error = fir ? 0.0 : 0.006;
         Taps passed{1.0};
         if (fir) passed = fir_taps();
         for (std::size_t i = 0; i < 2; ++i) noise_ratios[i] = norm(passed) * std::pow(51200.0 / rate_hz / 51.0, i == 0 ? -0.62 : -0.78);
@@ -108,6 +108,7 @@ struct Alignment {
     int lead;                      ///< this many samples are needed after a gap to tell the instant of force and torque
     std::array<Taps, 3> taps;      ///< to acceleration, angular rate and angular acceleration
     double felt_noise, spin_noise;           ///< deviations that the IMU's noise makes on each axis, m/s^2 and rad/s^2
+    double spin_error;                       ///< what this leaves of angular accelerations, as a share of them
     std::array<double, 2> noise_ratios{};    ///< of force and of torque, to those at SINC 51 with FIR off
 
 private:
@@ -186,7 +187,7 @@ public:
     /// `lever`: from the IMU to the center of gravity. The bias is of a tare, in which this specific force was felt (none: not known).
     Bounds(const Payload& tool, const Vector3& lever, const Alignment& alignment, bool tared, const std::optional<Vector3>& at = {})
         : tared_(tared), from_(at) {
-        constexpr double kPlace = 1.3e-3, kSpin = 0.0075, kAligned = 0.006, kNormal = 1.96;
+        constexpr double kPlace = 1.3e-3, kSpin = 0.013, kAlone = 1.15, kNormal = 1.96;
         const auto& [xx, yy, zz, xy, xz, yz] = tool.inertia;
         const std::array<Vector3, 3> tensor{{{xx, xy, xz}, {xy, yy, yz}, {xz, yz, zz}}};
         const double mass = tool.mass, weight = square(mass / kNormal), at_arm = 2.0 / 3.0 * sum(tool.center), levers = sum(lever);
@@ -200,7 +201,7 @@ public:
         const double spin = square(alignment.spin_noise);
         fixed_[0] = felt + (forces[0] + forces[1] + forces[2]) * spin + noise(0) + noise(1) + noise(2);
         fixed_[1] = at_arm * felt + (torques[0] + torques[1] + torques[2]) * spin + noise(3) + noise(4) + noise(5);
-        double wrong = square(kAligned);
+        double wrong = square(alignment.spin_error);
         if (tool.left != decltype(tool.left){}) {
             for (std::size_t part = 0; part < 2; ++part) {
                 const auto left = [&](std::size_t i) { return 3.0 * square(tool.left[3 * part + i]); };
@@ -211,29 +212,33 @@ public:
         } else {
             const auto& [c_xy, c_xz, c_yx, c_yz, c_zx, c_zy] = tool.cross_axis_interval;
             const std::array<std::array<double, 2>, 3> columns{{{c_yx, c_zx}, {c_xy, c_zy}, {c_xz, c_yz}}};
-            const double offset = tared ? 0.0 : weight * sum(tool.offset_interval), off = 2.0 * square(mass * kPlace);
-            fixed_[0] += offset, fixed_[1] += at_arm * offset, wrong += square(kSpin);
+            const double offset = tared ? 0.0 : weight * sum(tool.offset_interval), off = 2.0 * kAlone * square(mass * kPlace);
+            fixed_[0] += offset, fixed_[1] += at_arm * offset, wrong = kAlone * (wrong + square(kSpin));
             const auto halves = inertia_halves(tool);
             const std::array<Vector3, 3> elements{{{halves[0], halves[3], halves[4]}, {halves[3], halves[1], halves[5]}, {halves[4], halves[5], halves[2]}}};
             for (std::size_t i = 0; i < 3; ++i) {
                 by_felt_[0][i] = weight * (square(tool.scale_interval[i]) + square(columns[i][0]) + square(columns[i][1]));
-                by_felt_[1][i] = weight * (sum(tool.center_interval) - square(tool.center_interval[i])) + at_arm * by_felt_[0][i];
-                by_spin_[0][i] = off, by_spin_[1][i] = sum(elements[i]) / square(kNormal) + at_arm * off;
+                const double centers = kAlone * weight * (sum(tool.center_interval) - square(tool.center_interval[i]));
+                by_felt_[1][i] = centers + at_arm * by_felt_[0][i], by_spin_[0][i] = off + centers;
+                by_spin_[1][i] = sum(elements[i]) / square(kNormal) + at_arm * by_spin_[0][i];
             }
         }
-        for (std::size_t i = 0; i < 3; ++i) by_spin_[0][i] += wrong * forces[i], by_spin_[1][i] += wrong * torques[i];
+        for (std::size_t i = 0; i < 3; ++i) {
+            by_spin_[0][i] += wrong * forces[i], by_spin_[1][i] += wrong * torques[i];
+            for (std::size_t part = 0; part < 2; ++part) still_[part] -= spin * by_spin_[part][i];
+        }
     }
 
     /// N, Nm. `felt`, m/s^2, at the center of gravity; `rate`, rad/s; `spin`, rad/s^2.
     std::array<double, 2> at(const Vector3& felt, const Vector3& rate, const Vector3& spin) const noexcept {
-        std::array<double, 2> found = fixed_;
+        std::array<double, 2> found = fixed_, spun = still_;
         const double quarter = 0.25 * sum(rate);
         for (std::size_t i = 0; i < 3; ++i) {
             const double less = tared_ && from_ ? (*from_)[i] : 0.0, turned = square(spin[i]) + quarter * square(rate[i]);
             const double moved = tared_ && !from_ ? 2.0 / 3.0 * square(kStandardGravity) : square(felt[i] - less);
-            for (std::size_t part = 0; part < 2; ++part) found[part] += by_felt_[part][i] * moved + by_spin_[part][i] * turned;
+            for (std::size_t part = 0; part < 2; ++part) found[part] += by_felt_[part][i] * moved, spun[part] += by_spin_[part][i] * turned;
         }
-        return {std::sqrt(7.815 / 3.0 * found[0]), std::sqrt(2.8 * found[1])};
+        return {std::sqrt(7.815 / 3.0 * (found[0] + std::max(spun[0], 0.0))), std::sqrt(2.8 * (found[1] + std::max(spun[1], 0.0)))};
     }
 
 private:
@@ -247,13 +252,13 @@ private:
         if (halves != decltype(halves){}) return halves;
         const double moment = *std::max_element(tool.inertia.begin(), tool.inertia.end()), reach = tool.mass * (0.01 + sum(tool.center));
         halves.fill(0.1 * moment);
-        const double about = std::hypot(1.96 * 0.2, 0.6) * reach, across = 0.2 * reach;
+        const double about = std::hypot(1.96 * 0.2, 0.5) * reach, across = 0.2 * reach;
         return tool.inertia != decltype(tool.inertia){} ? halves : decltype(halves){about, about, about, across, across, across};
     }
 
     bool tared_;
     std::optional<Vector3> from_;
-    std::array<double, 2> fixed_{};  // N^2, Nm^2
+    std::array<double, 2> fixed_{}, still_{};  // N^2, Nm^2
     std::array<Vector3, 2> by_felt_{}, by_spin_{};
 };
 
