@@ -40,9 +40,8 @@ _TYPED: Final = 0.1  # of its largest element: half of the interval of a tensor 
 # Of an IMU that is not identified: how far from its place, m, and how wrong its angular acceleration is; of
 # any, what alignment leaves of that where FIR is off.
 _OFF_PLACE, _SPIN, _ALIGNED = 1.3e-3, 0.013, 0.006
-_ALONE: Final = (
-    1.15  # chi squared of two axes by that of three: what is unknown of tool and IMU pushes along two
-)
+# Chi squared of two axes by that of three: errors of an IMU, or of a center of gravity, push along two.
+_ALONE: Final = 1.15
 _REFERENCE_SINC: Final = 51
 _NO_TARE: Final = TareBasis()
 

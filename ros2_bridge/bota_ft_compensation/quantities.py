@@ -74,7 +74,7 @@ def wrench_text(wrench: Wrench) -> str:
 
 NO_PAYLOAD: Final = Payload()
 _REACH: Final = 0.1  # m: how far the mass of a tool is likely to be from a center of gravity at the origin
-_LIKELY, _ABOUT = 0.2, 0.5
+_LIKELY, _ABOUT = 0.2, 0.45
 # m/s²: standard deviation of the offset of an axis of a MEMS accelerometer, once soldered.
 OFFSET_PRIOR: Final = 0.4
 # Likewise of an axis' sensitivity, relative (local gravity is within it), and of what it has of another axis.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bota_ethercat.sensor.response import healthy_noise
 from bota_ft_compensation.compensator import Compensator
 from bota_ft_compensation.quantities import NO_WRENCH, Payload
 from tests.compensation.making import BIAS, TOOL, gravity_for, load
@@ -57,6 +59,12 @@ def test_the_example_runs_and_every_mistake_is_tried() -> None:
     left = left_over("center of gravity wrong")
     assert np.abs(left[:, :3]).max() < 1e-9
     assert np.abs(left[:, 3:]).max() > 0.1
+
+
+def test_the_noise_of_short_and_long_filters_is_that_of_a_healthy_sensor() -> None:
+    size, healthy = 0.1 * math.sqrt(3.0), [healthy_noise(length)[0] for length in (32, 64)]
+    told = f"{size:.2f} N in all, and {size * healthy[0] / healthy[1]:.2f} N at SINC 32"
+    assert told in PAGE.replace("\n", " ")
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

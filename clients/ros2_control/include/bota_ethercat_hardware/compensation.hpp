@@ -252,7 +252,7 @@ private:
         if (halves != decltype(halves){}) return halves;
         const double moment = *std::max_element(tool.inertia.begin(), tool.inertia.end()), reach = tool.mass * (0.01 + sum(tool.center));
         halves.fill(0.1 * moment);
-        const double about = std::hypot(1.96 * 0.2, 0.5) * reach, across = 0.2 * reach;
+        const double about = std::hypot(1.96 * 0.2, 0.45) * reach, across = 0.2 * reach;
         return tool.inertia != decltype(tool.inertia){} ? halves : decltype(halves){about, about, about, across, across, across};
     }
 
