@@ -31,7 +31,7 @@ from bota_ft_compensation.quantities import (
 FARTHEST_M: Final = 10.0  # from the sensor: what a parameter may name
 # Chi squared that 95 % keep to, with 6 and with 2 degrees of freedom, and the root of that with 3.
 _RELEASE, _REGION, _CHI_3 = 12.592, 5.991, 2.795
-_IMU_MOTION: Final = 0.12  # m/s² on each axis: deviation of what alignment leaves of motion, by its extremes
+_IMU_MOTION: Final = 0.08  # m/s² on each axis: deviation of what alignment leaves of motion, by its extremes
 
 
 class Why(Enum):

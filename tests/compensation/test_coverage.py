@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 
-from tests.compensation.coverage import CASES, KINDS, MOTIONS, Case, alarms, bounds, intervals, judged
+from tests.compensation import coverage, motion
+from tests.compensation.coverage import (
+    CASES,
+    KINDS,
+    MOTIONS,
+    Case,
+    alarms,
+    bounds,
+    contacts,
+    intervals,
+    judged,
+)
 from tests.compensation.making import SEED
 from tests.simulation import more_if_long
 
@@ -67,6 +80,16 @@ def test_in_95_percent_of_samples_the_error_is_within_the_bounds(
     assert case == CUT_OFF or (force_wide < 1.6, torque_wide < 1.6) == (True, True)
     if (name, case, "motion" in kind) == ("polishing", Case(), True):
         assert left < 0.30
+
+
+def test_1_n_on_a_tool_of_2_kg_is_contact_within_100_ms(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(coverage, "tool_of", functools.partial(motion.tool_of, mass=2.0))
+    seed = 1000 * SEED + 777
+    imu, tool, rest = coverage.imu_of(seed), motion.tool_of(seed, 2.0), MOTIONS["rest"](seed)
+    felt = coverage.felt_in(rest, tool, 21.0, Case(), imu, seed)
+    pressed = (felt.times[:, None] % 1.0 > 0.9) * np.array([0.0, 0.0, -1.0])
+    stream = coverage.stream_for("poses and motion", Case(), seed)
+    assert contacts(stream, felt._replace(force=felt.force + pressed)) >= 19
 
 
 @pytest.mark.long
