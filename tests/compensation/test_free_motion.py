@@ -259,12 +259,12 @@ def test_the_noise_of_samples_is_what_is_left_less_what_the_imu_makes() -> None:
     draw, payload = np.random.default_rng(SEED), Payload(1.5, (0.01, 0.03, 0.2))
     left = draw.normal(size=(500, 6)) * [0.02, 0.02, 0.002, 1e-3, 4e-3, 3e-4]
     still = np.zeros(3)
-    turned = instants([Read(still, still, still, 0.0)])._replace(noisier=5.0, imu_noise=0.02)
+    turned = instants([Read(still, still, still, 0.0)])._replace(noisier=5.0, imu_noise=0.004)
     found = _noise(turned, _Answer(np.zeros(52), np.eye(52), 1.0, left, 1.0), payload)
     for axis, value in enumerate(found):
-        whole = 25.0 * float(np.mean(left[:, axis] ** 2))
+        whole = float(np.mean(left[:, axis] ** 2))
         arm = 1.0 if axis < 3 else math.hypot(*np.delete(payload.center, axis - 3))
-        assert value == pytest.approx(math.sqrt(max(whole - (1.5 * 0.02 * arm) ** 2, whole / 10)))
+        assert value == pytest.approx(5.0 * math.sqrt(max(whole - (1.5 * 0.004 * arm) ** 2, whole / 10)))
 
 
 def test_of_the_imu_is_known_before_what_is_typical_and_what_poses_say() -> None:

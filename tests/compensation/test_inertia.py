@@ -249,8 +249,10 @@ def test_all_that_is_made_of_samples_obeys_the_equations_of_motion(chosen: dict[
             at = np.arange(own[0], own[-1], period)[:: max(1, round(0.0125 / period))]
             expected += at[(at > own[0] + reach) & (at < own[-1] - 0.05)].tolist()
     assert made.times.tolist() == expected
-    width = max(3, round(0.05 / period) | 1) + 1  # of a Hann window, whose squares sum to 1.5 by that
-    assert made.noisier == pytest.approx(math.sqrt(width / 1.5))
+    window = np.hanning(max(3, round(0.05 / period) | 1) + 2)[1:-1]
+    noise = motion.noise_like(given, (100_000, 2), SEED)
+    smooth = [np.convolve(column, window / window.sum(), "valid") for column in noise.T]
+    assert made.noisier == pytest.approx(1.0 / np.std(smooth), rel=0.1)
     with pytest.raises(CompensationError, match="there is a gap in every half second"):
         turn(felt.times + np.floor(felt.times / 0.2), np.hstack(felt[1:]), aligned, EXACT, IMU)
 
