@@ -8,17 +8,7 @@ import numpy as np
 import pytest
 
 from tests.compensation import coverage, motion
-from tests.compensation.coverage import (
-    CASES,
-    KINDS,
-    MOTIONS,
-    Case,
-    alarms,
-    bounds,
-    contacts,
-    intervals,
-    judged,
-)
+from tests.compensation.coverage import CASES, KINDS, MOTIONS, Case, bounds, intervals, judged
 from tests.compensation.making import SEED
 from tests.simulation import more_if_long
 
@@ -89,7 +79,7 @@ def test_1_n_on_a_tool_of_2_kg_is_contact_within_100_ms(monkeypatch: pytest.Monk
     felt = coverage.felt_in(rest, tool, 21.0, Case(), imu, seed)
     pressed = (felt.times[:, None] % 1.0 > 0.9) * np.array([0.0, 0.0, -1.0])
     stream = coverage.stream_for("poses and motion", Case(), seed)
-    assert contacts(stream, felt._replace(force=felt.force + pressed)) >= 19
+    assert coverage.contacts(stream, felt._replace(force=felt.force + pressed)) >= 19
 
 
 @pytest.mark.long
@@ -97,4 +87,4 @@ def test_1_n_on_a_tool_of_2_kg_is_contact_within_100_ms(monkeypatch: pytest.Monk
 @pytest.mark.parametrize("sinc_length", [32, 64, 512])
 @pytest.mark.parametrize("name", MOTIONS)
 def test_in_an_hour_of_every_motion_it_is_contact_at_most_once(name: str, sinc_length: int) -> None:
-    assert alarms("poses and motion", name, Case(sinc_length=sinc_length), 60, 1000 * SEED) <= 1
+    assert coverage.alarms("poses and motion", name, Case(sinc_length=sinc_length), 60, 1000 * SEED) <= 1
