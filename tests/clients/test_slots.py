@@ -68,14 +68,14 @@ class Slot(NamedTuple):
 EMPTY = Slot([], 0, -1, -1, 0)
 
 
-def stream(seed: int, parts: int = 3, count: int = 120) -> list[Part]:
+def stream(seed: int, parts: int = 5, count: int = 100) -> list[Part]:
     """Samples that are lost on the bus (GAP) or not read in time (their numbers are missing), and others."""
     draw = random.Random(seed)
     found, at_ns, sequence, epoch = list[Part](), draw.randrange(10**9, 10**15), draw.randrange(10**6), 0
     for _ in range(parts):
         rate_hz, frames = draw.choice((800.0, 800.0, 400.0)), list[DataMessage]()
         epoch += draw.random() < 0.6
-        for number in range(count):
+        for number in range(count if parts == 1 or draw.random() < 0.7 else 0):
             lost = draw.choice((0,) * 9 + (1, 2, 5, 40))
             jump = draw.choice((0, 0, lost, lost + 1))
             flags = GAP if draw.random() < (0.8 if lost else 0.1) else 0

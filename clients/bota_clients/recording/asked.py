@@ -90,22 +90,9 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     add_imu_units(parser)
     add = parser.add_argument
     what = "seconds from the start (30, 5min), or a time (2026-11-29T12:00:05Z)"
-    add(
-        "--from",
-        dest="begin",
-        action=_Ends,
-        type=typed(Moment.parse, what),
-        metavar="TIME",
-        help=f"from there on: {what}",
-    )
-    add(
-        "--to",
-        dest="end",
-        action=_Ends,
-        type=typed(Moment.parse, what),
-        metavar="TIME",
-        help="until before it",
-    )
+    when: dict[str, Any] = {"action": _Ends, "type": typed(Moment.parse, what), "metavar": "TIME"}
+    add("--from", dest="begin", help=f"from there on: {what}", **when)
+    add("--to", dest="end", help="until before it", **when)
     add("--rate", type=number(1e-3, 1e6), default=0.0, metavar="HZ",
         help="the sampling rate, if another program has left it out of the recording")  # fmt: skip
     add("--set", type=typed(parse_assignment), action="append", default=[], metavar="NAME=VALUE",
