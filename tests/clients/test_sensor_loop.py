@@ -507,7 +507,8 @@ def test_a_tare_in_any_pose_is_right_in_every_pose(running: Loop, server: Script
 
 def test_the_delay_of_the_force_is_that_of_the_description(running: Loop) -> None:
     """Two sample periods: the newest force is that of the acceleration two samples before, on a line."""
-    with ScriptedServer(rate_hz=100, delay_ms={"force_torque": 25.0, "acceleration": 5.0}) as server:
+    delay_ms, offset = {"force_torque": 25.0, "acceleration": 5.0}, [1.0] * 6  # no bias goes with the offset
+    with ScriptedServer(rate_hz=100, delay_ms=delay_ms, offset=offset) as server:
         loop = running.opened(server.port, tool_mass=1)
         begin_ns = time.monotonic_ns() - 50_000_000
         for number in range(1, 9):

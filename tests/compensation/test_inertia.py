@@ -129,6 +129,8 @@ def test_samples_with_contact_are_left_out_and_what_no_body_has_is_refused() -> 
     found = identified(touched, tool, imu)
     assert found.payload.inertia == pytest.approx(tool.inertia, abs=5e-4)
     assert found.notes == ()
+    drifted = identified(felt._replace(force=felt.force + np.array([0.5, 0.0, 0.0])), tool, imu)
+    assert drifted.bias.force == pytest.approx(BIAS.force, abs=0.2), "that in the poses"
     with pytest.raises(CompensationError, match="touched the tool all the time"):
         identified(felt._replace(force=felt.force + np.array([4.0, 0.0, 0.0])), tool, imu)
     for factor, told in ((-1.0, "-1.0"), (np.degrees(1.0), "0.01"), (np.radians(1.0), "6")):
