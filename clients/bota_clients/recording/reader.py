@@ -175,8 +175,9 @@ class Recording(McapFile):
             self.sensors = tuple(map(self._in_part, self.sensors))
         self.frame_count = sum(each.frames for each in self.sensors)
         if self.asked.part and not self.frame_count and any(counts.values()):
-            stamps = [item["stamp_ns"] for item in self._tables(None) if isinstance(item, np.ndarray)]
-            begin_ns, end_ns = (int(stamps[row][row]) if stamps else 0 for row in (0, -1))
+            ends = (item["stamp_ns"][[0, -1]] for item in self._tables(None) if isinstance(item, np.ndarray))
+            stamps = [stamp for each in ends for stamp in each.tolist()] or [0]  # and not all tables
+            begin_ns, end_ns = stamps[0], stamps[-1]
             long = f"it is {seconds((end_ns - begin_ns) * 1e-9)} long, from {moment(begin_ns)} on"
             raise RecordingError(f"{self.path} has nothing {self.asked.part}: {long}")
 
