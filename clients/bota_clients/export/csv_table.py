@@ -31,7 +31,6 @@ COLUMNS: Final = (
 )  # fmt: skip
 _GAP: Final = int(DataFlag.GAP)
 # Nine digits keep a REAL32 to the bit.
-_TURNED: Final = [f"orientation.{axis}" for axis in "xyzw"]
 _ORIENTATION: Final = ",".join(["%.9g"] * 4)
 _WHOLE: Final = ["%d"] * (len(_FLAGS) + len(REGISTERS))
 _LINE: Final = ",".join(["%.9f,%sZ,%d,%d", *["%.9g"] * 13, "%s", *_WHOLE]) + "\n"
@@ -99,10 +98,8 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
 def _lines(table: Table, samples: Columns, flags: Ints, places: Ints, first_ns: int) -> Iterator[str]:
     reals = np.column_stack([*(getattr(samples, name) for name, _ in VECTORS), samples.temperature])
     turned = ["," * 3] * len(samples)
-    if _TURNED[0] in (table.dtype.names or ()):
-        parts = np.column_stack([table[name] for name in _TURNED])
-        for row in np.flatnonzero(parts.any(axis=1)).tolist():
-            turned[row] = _ORIENTATION % (*parts[row].tolist(),)
+    for row in np.flatnonzero(~np.isnan(samples.orientation).all(axis=1)).tolist():
+        turned[row] = _ORIENTATION % (*samples.orientation[row].tolist(),)
     marks = [((flags & int(flag)) != 0).astype(int).tolist() for flag in _FLAGS]
     times = [place / _SECOND for place in (places - first_ns).tolist()]
     stamps = np.datetime_as_string(samples.stamp_ns.view("datetime64[ns]")).tolist()

@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from bota_clients.export.windows import Arrays, Windows, interpolated, read_tool
+from bota_clients.export.windows import Arrays, Rows, Windows, read_tool
 from bota_clients.recording.columns import columns
 from bota_clients.recording.order import TimeAxis
 from bota_ethercat.client import Client
@@ -29,6 +29,7 @@ from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.stream.timeline import InForce
 
 _KEEP_S: Final = 1.0
+_STAMPS: Final = np.dtype([("stamp_ns", "i8"), ("monotonic_ns", "i8")])
 
 
 class LiveWindows:
@@ -58,7 +59,9 @@ class LiveWindows:
         self._axis, self._keep_ns, self._shift_ns = TimeAxis(), round(keep_s * 1e9), 0
         self._in_force: InForce | None = None
         self._never = threading.Event()
-        self._clocks = np.zeros((2, 0), np.int64)  # of the samples that are kept: both stamps
+        self._clocks = Rows(_STAMPS)  # of the samples that are kept, since the clock was set back last
+        # Of the newest sample: its place, and by how much later it arrived, by this machine's clock.
+        self._newest_ns = self._behind_ns = 0
 
     def at(
         self, stamp_ns: int | None = None, *, monotonic_ns: int | None = None, timeout_s: float = 0.05
@@ -71,52 +74,47 @@ class LiveWindows:
         Call it at least every second, so that no samples pile up. RecordingError if the sampling rate is
         unknown.
         """
-        channel, windows, items = self._client.channel, self._windows, list(self._client.poll_all(0.0))
+        channel, windows, items = self._client.channel, self._windows, list[Item]()
         deadline_ns = channel.monotonic_ns() + round(timeout_s * 1e9)
         while True:
-            left_ns = deadline_ns - channel.monotonic_ns()
-            early_ns = min(max(self._early_ns(items, stamp_ns, monotonic_ns), 0), left_ns)
-            if left_ns <= 0 or early_ns <= 0:
+            now_ns, instant = channel.monotonic_ns(), self._instant(stamp_ns, monotonic_ns)
+            left_ns = 0 if 0 <= instant <= windows.until_ns else max(deadline_ns - now_ns, 0)
+            if (early_ns := min(self._early_ns(instant, now_ns), left_ns)) > 0:
+                channel.wait(self._never, early_ns * 1e-9)
+            items += self._client.poll_all((left_ns - max(early_ns, 0)) * 1e-9)
+            now_ns = channel.monotonic_ns()
+            newest = next((each for each in reversed(items) if isinstance(each, DataMessage)), None)
+            if newest is not None:
+                self._behind_ns = now_ns - newest.monotonic_ns
+            # Frames wait for each other, as many at once cost what one does.
+            if now_ns >= deadline_ns or self._early_ns(instant, now_ns) <= 0:
                 self._take(items)
                 instant, items = self._instant(stamp_ns, monotonic_ns), []
-                if left_ns <= 0 or (self._clocks.size and instant <= windows.until_ns):
+                if now_ns >= deadline_ns or 0 <= instant <= windows.until_ns:
                     break
-            else:
-                channel.wait(self._never, early_ns * 1e-9)
-            items += self._client.poll_all((left_ns - early_ns) * 1e-9)
         found = windows.at(np.array([instant]), is_partial=True)
         return {name: array[0] for name, array in found.items()} | {
             "monotonic_ns": np.array(instant - self._shift_ns),
             "is_complete": np.array(0 <= instant <= windows.until_ns),
         }
 
-    def _early_ns(self, items: list[Item], stamp_ns: int | None, monotonic_ns: int | None) -> int:
-        """How long before the instant the newest of these frames was measured; 0: it was not.
-
-        Frames wait for each other, as many at once cost what one does.
-        """
-        frames = (each for each in reversed(items) if isinstance(each, DataMessage))
-        newest = next((each for each in frames if each.sensor == self._sensor), None)
-        if newest is None or not self._clocks.size:
-            return 0
-        delay_ns = int(self._clocks[1, -1]) - self._windows.until_ns
-        if monotonic_ns is not None:
-            return monotonic_ns + delay_ns - newest.monotonic_ns
-        return 0 if stamp_ns is None else stamp_ns + delay_ns - newest.stamp_ns
+    def _early_ns(self, instant: int, now_ns: int) -> int:
+        """How long until the sample arrives that completes the window of an instant, by those before it."""
+        newest_ns = now_ns - self._behind_ns + self._shift_ns
+        return instant + self._newest_ns - self._windows.until_ns - newest_ns if self._newest_ns else 0
 
     def _instant(self, stamp_ns: int | None, monotonic_ns: int | None) -> int:
         """On the axis of the windows; -1 if nothing is known."""
         if monotonic_ns is not None:
             return monotonic_ns + self._shift_ns
-        if stamp_ns is None or not self._clocks.size:
+        clocks = self._clocks.array
+        if stamp_ns is None or not len(clocks):
             return self._windows.until_ns
-        # Since the clock was set back last: what was before has the same times.
-        back = np.flatnonzero(np.diff(self._clocks[0]) < 0)[-1:].max(initial=-1) + 1
-        stamps, instants = self._clocks[:, back:]
-        if stamps[0] <= stamp_ns <= stamps[-1]:
-            return int(interpolated(np.array([stamp_ns]), stamps, instants)[0])
-        nearest = 0 if stamp_ns < stamps[0] else -1
-        return int(instants[nearest]) + stamp_ns - int(stamps[nearest])
+        behind = int(np.searchsorted(clocks["stamp_ns"], stamp_ns))
+        near: list[tuple[int, int]] = clocks[max(behind - 1, 0) : behind + 1].tolist()
+        (stamp, instant), (later, then) = near[0], near[-1]
+        rate = (then - instant) / (later - stamp) if later > stamp else 1.0
+        return instant + round((stamp_ns - stamp) * rate)
 
     def _take(self, items: list[Item]) -> None:
         frames = list[DataMessage]()
@@ -136,11 +134,15 @@ class LiveWindows:
         for in_force, batch in self._axis.batches([arrived]):
             self._windows.configure(in_force)
             new = self._windows.add(batch)
-            self._clocks = np.hstack([self._clocks, (new.stamp_ns, new.monotonic_ns)])
-        self._shift_ns = self._axis.shift_ns
+            rows = np.empty(len(new), _STAMPS)
+            rows["stamp_ns"], rows["monotonic_ns"] = new.stamp_ns, new.monotonic_ns
+            self._clocks.add(rows)
+            latest = self._clocks.array[-len(new) - 1 :]["stamp_ns"]
+            if len(back := np.flatnonzero(latest[1:] < latest[:-1])):  # before, the same times were
+                self._clocks.take(len(self._clocks) - len(latest) + int(back[-1]) + 1)
+        self._shift_ns, clocks = self._axis.shift_ns, self._clocks.array["monotonic_ns"]
+        self._newest_ns = int(clocks[-1]) if len(clocks) else 0
         oldest_ns = self._windows.until_ns - self._keep_ns
-        if not self._clocks.size or self._clocks[1, 0] > oldest_ns - self._keep_ns // 2:
-            return  # now and then is enough
-        self._windows.forget(oldest_ns)
-        kept = max(int(np.searchsorted(self._clocks[1], oldest_ns)) - 1, 0)
-        self._clocks = self._clocks[:, kept:].copy()
+        if len(clocks) and clocks[0] <= oldest_ns - self._keep_ns // 2:  # now and then is enough
+            self._windows.forget(oldest_ns)
+            self._clocks.take(max(int(np.searchsorted(clocks, oldest_ns)) - 1, 0))

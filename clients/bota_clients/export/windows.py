@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
 from bota_clients.identify.tool_file import tool_parameters
-from bota_clients.recording.columns import Columns, Ints
+from bota_clients.recording.columns import Bools, Columns, Ints
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.replies import Delays
@@ -34,9 +34,11 @@ from bota_ft_compensation.stream import CompensatedStream
 
 Array = npt.NDArray[Any]
 Arrays = dict[str, Array]
+_GAP: Final = int(DataFlag.GAP)
 _CHANNELS: Final = {FORCE_TORQUE: slice(0, 6), ACCELERATION: slice(6, 9), ANGULAR_RATE: slice(9, 12)}
 _SLOT: Final = np.dtype([
     ("measured_ns", "i8", 3),  # by channel; of an empty slot by its place between two samples
+    ("latest_ns", "i8", 3),  # the latest of these so far
     ("values", "f4", 12),  # force, torque, acceleration, angular rate: N, Nm, m/s², rad/s; NaN: empty
     ("valid", "?", 3),  # by channel
     ("compensated", "f4", 6),  # N, Nm; NaN: not known
@@ -45,7 +47,42 @@ _SLOT: Final = np.dtype([
     ("sequence", "i8"),  # -1: there was no such frame, or it is not known which
     ("number", "i8"),  # of the sample, from 0 on; -1: empty
 ])  # fmt: skip
-_WHOLE: Final = np.dtype((np.void, _SLOT.itemsize))  # a slot copied at once, and not field by field
+_EMPTY: Final = np.array(
+    [((-1,) * 3, (-1,) * 3, (math.nan,) * 12, (False,) * 3, (math.nan,) * 6, (math.nan,) * 2, -1, -1, -1)],
+    _SLOT,
+)
+
+
+class Rows:
+    """Rows of an array: new ones come at its end, old ones go at its beginning."""
+
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        self._whole = np.dtype((np.void, dtype.itemsize))  # a row copied at once, and not field by field
+        self._room, self._dtype = np.zeros(0, self._whole), dtype
+        self._begin = self._end = 0
+
+    def __len__(self) -> int:
+        return self._end - self._begin
+
+    @property
+    def array(self) -> Array:
+        """Those that are kept, until the next change."""
+        return self._room[self._begin : self._end].view(self._dtype)
+
+    def add(self, rows: Array) -> None:
+        end = self._end + len(rows)
+        if end > len(self._room):
+            kept = self._room[self._begin : self._end]
+            self._begin, self._end, end = 0, len(kept), len(kept) + len(rows)
+            self._room = np.concatenate([kept, np.zeros(2 * end - len(kept), self._whole)])
+        self._room[self._end : end] = rows.view(self._whole)
+        self._end = end
+
+    def take(self, count: int) -> Array:
+        """The oldest, which go."""
+        taken = self.array[:count]
+        self._begin += len(taken)
+        return taken
 
 
 def interpolated(at: Ints, here: Ints, there: Ints) -> Ints:
@@ -81,7 +118,7 @@ class Windows:
         self.begin_ns, self.tool = -1, tool
         self._length, self.imu_units = length, imu_units
         self.stream: CompensatedStream | None = None
-        self._slots = np.zeros(0, _SLOT)
+        self._slots = Rows(_SLOT)
         self._until_ns = np.full(3, -1)  # by channel: the latest measured
         self._newest = (0, 0)  # stamp and sequence of the newest sample
         self._taken = self._epoch = 0  # samples; of what is in force
@@ -119,7 +156,8 @@ class Windows:
         newest_ns = self._newest[0]
         if self.begin_ns >= 0 and not was_announced:
             since_ns = newest_ns - self.doubt_ns - self._delay_ns[0]
-            self._slots["compensated"][self._slots["measured_ns"][:, 0] >= since_ns] = math.nan
+            slots = self._slots.array
+            slots["compensated"][slots["measured_ns"][:, 0] >= since_ns] = math.nan
 
     @property
     def doubt_ns(self) -> int:
@@ -133,19 +171,52 @@ class Windows:
 
     def add(self, frames: Columns) -> Columns:
         """Take the next frames of the sensor, also REPEATED and INVALID ones; the samples. RecordingError."""
-        samples = frames if frames.fresh.all() else frames.where(frames.fresh)
+        is_fresh = frames.fresh
+        samples = frames if is_fresh.all() else frames.where(is_fresh)
         if not len(samples):
             return samples
         stamps, sequence = samples.monotonic_ns, samples.sequence
         if self.begin_ns < 0:
             self.begin_ns, self._newest = int(stamps[0]), (int(stamps[0]) - 1, int(sequence[0]) - 1)
-        passed = np.diff(stamps, prepend=self._newest[0])
-        if (passed <= 0).any():
+        passed = stamps - np.concatenate([self._newest[:1], stamps[:-1]])
+        if passed.min() <= 0:
             raise RecordingError("the server's machine was restarted meanwhile: record again")
-        further = np.diff(sequence, prepend=self._newest[1])
-        is_gap = (samples.flags & int(DataFlag.GAP) != 0) | (further != 1)
-        is_gap[0], self._begins = is_gap[0] or self._begins, False
+        further = sequence - np.concatenate([self._newest[1:], sequence[:-1]])
         self._newest = int(stamps[-1]), int(sequence[-1])
+        slots = self._slots_of(samples)
+        is_gap = (samples.flags & _GAP != 0) | (further != 1)
+        is_gap[0], self._begins = is_gap[0] or self._begins, False
+        if is_gap.any():
+            slots = self._spread(slots, passed, further, is_gap)
+        np.maximum.accumulate(slots["measured_ns"], axis=0, out=slots["latest_ns"])
+        slots["latest_ns"] = np.maximum(slots["latest_ns"], self._until_ns)
+        self._until_ns = slots["latest_ns"][-1]
+        self._slots.add(slots)
+        return samples
+
+    def _slots_of(self, samples: Columns) -> Array:
+        slots = np.empty(len(samples), _SLOT)
+        slots["monotonic_ns"], slots["sequence"] = samples.monotonic_ns, samples.sequence
+        slots["measured_ns"] = samples.monotonic_ns[:, np.newaxis] - self._delay_ns
+        slots["number"] = np.arange(self._taken, self._taken + len(slots))
+        self._taken += len(slots)
+        values = np.hstack([samples.force, samples.torque, samples.acceleration, samples.angular_rate])
+        is_finite = np.isfinite(values)
+        if not (are_finite := is_finite.all()):
+            values[~is_finite] = math.nan
+        slots["values"] = values
+        for place, (channel, part) in enumerate(_CHANNELS.items()):
+            is_good = channel.flagged(samples) == 0
+            slots["valid"][:, place] = is_good if are_finite else is_good & is_finite[:, part].all(axis=1)
+        if self._known.get("imu_active") == 0:
+            slots["valid"][:, 1:] = False
+        slots["compensated"], slots["bounds"] = (
+            (math.nan, math.nan) if self.stream is None else self.stream.compensate(samples)
+        )
+        return slots
+
+    def _spread(self, slots: Array, passed: Ints, further: Ints, is_gap: Bools) -> Array:
+        """With empty slots where samples were lost: by how much time and sequence went on before each."""
         lost = np.maximum(np.rint(passed * (self._rate_hz * 1e-9)).astype(np.int64) - 1, 0) * is_gap
         # Of the slots of lost samples the first ones do: a window is not longer.
         kept = np.minimum(lost, self._length)
@@ -153,29 +224,14 @@ class Windows:
         of = np.repeat(np.arange(len(end)), kept + 1)
         after = np.arange(len(of)) - (end - kept)[of] + 1  # periods since the sample before
         since_ns = np.rint(passed[of] * (after / (lost[of] + 1))).astype(np.int64)
-        since_ns[end] = passed
-        slots = np.zeros(len(of), _SLOT)
-        slots["monotonic_ns"] = (stamps - passed)[of] + since_ns
-        slots["measured_ns"] = slots["monotonic_ns"][:, np.newaxis] - self._delay_ns
+        spread = np.repeat(_EMPTY, len(of))
+        spread["monotonic_ns"] = (slots["monotonic_ns"] - passed)[of] + since_ns
+        spread["measured_ns"] = spread["monotonic_ns"][:, np.newaxis] - self._delay_ns
         # A frame that was not read in time has a number, a sample that the server never had does not.
-        slots["sequence"] = np.where((further == lost + 1)[of], (sequence - further)[of] + after, -1)
-        at: Any = end if kept.any() else slice(None)
-        slots["sequence"][at], slots["number"] = sequence, -1
-        slots["number"][at] = np.arange(self._taken, self._taken + len(end))
-        self._taken += len(end)
-        values = np.hstack([samples.force, samples.torque, samples.acceleration, samples.angular_rate])
-        slots["values"] = math.nan
-        slots["values"][at] = np.where(np.isfinite(values), values, math.nan)
-        is_off = self._known.get("imu_active") == 0
-        for place, (channel, part) in enumerate(_CHANNELS.items()):
-            is_good = (channel.flagged(samples) == 0) & np.isfinite(values[:, part]).all(axis=1)
-            slots["valid"][at, place] = is_good & (channel is FORCE_TORQUE or not is_off)
-        slots["compensated"][at], slots["bounds"][at] = (
-            (math.nan, math.nan) if self.stream is None else self.stream.compensate(samples)
-        )
-        self._until_ns = np.maximum(self._until_ns, slots["measured_ns"].max(axis=0))
-        self._slots = np.concatenate([self._slots.view(_WHOLE), slots.view(_WHOLE)]).view(_SLOT)
-        return samples
+        is_numbered = (further == lost + 1)[of]
+        spread["sequence"] = np.where(is_numbered, (slots["sequence"] - further)[of] + after, -1)
+        spread[end] = slots
+        return spread
 
     def at(self, instants_ns: Ints, *, is_partial: bool = False) -> Arrays:
         """Windows of these f instants; the last sample of each is the newest.
@@ -186,40 +242,44 @@ class Windows:
         """
         if not is_partial and (instants_ns > self.until_ns).any():
             raise ValueError(f"after {self.until_ns} ns not all samples are here: take more")
-        slots, found = self._slots if len(self._slots) else np.zeros(1, _SLOT), Arrays()
+        slots, found = self._slots.array, Arrays()
+        ends = np.array([self._ends(instants_ns, channel) for channel in range(3)])
+        if not len(slots):
+            slots = _EMPTY
+        elif is_partial:
+            late_ns = np.maximum(instants_ns - slots["measured_ns"][-1][:, np.newaxis], 0)
+            ends += (late_ns * (self._rate_hz * 1e-9)).astype(np.int64)
+        index = ends[..., np.newaxis] + np.arange(-self._length, 0)  # (channel, f, length)
+        is_there = (index >= 0) & (index < len(slots))
+        index = np.minimum(np.maximum(index, 0), len(slots) - 1)
+        channels = np.arange(3)[:, np.newaxis, np.newaxis]
+        valid = slots["valid"][index, channels] & is_there
+        age_s = ((instants_ns[:, np.newaxis] - slots["measured_ns"][index, channels]) * 1e-9).astype(
+            np.float32
+        )
+        age_s[~valid] = math.nan
+        wrench = slots["compensated"][index[0]]
         for channel, ((name, *_), part) in enumerate(_CHANNELS.items()):
-            ends = self._ends(instants_ns, channel)
-            if is_partial and len(self._slots):
-                late_ns = np.maximum(instants_ns - self._slots["measured_ns"][-1, channel], 0)
-                ends = ends + np.int64(late_ns * (self._rate_hz * 1e-9))
-            index = ends[:, np.newaxis] + np.arange(-self._length, 0)
-            is_there = (index >= 0) & (index < len(self._slots))
-            index = np.clip(index, 0, len(slots) - 1)
-            valid = slots["valid"][index, channel] & is_there
-            age_s = (instants_ns[:, np.newaxis] - slots["measured_ns"][index, channel]) * 1e-9
-            values, wrench = slots["values"][index, part], slots["compensated"][index]
-            age_s[~valid] = values[~valid] = wrench[~valid] = math.nan
-            found |= {name: values, f"{name}_age": age_s.astype(np.float32), f"{name}_valid": valid}
+            values = slots["values"][index[channel], part]
+            values[~valid[channel]] = math.nan
+            found |= {name: values, f"{name}_age": age_s[channel], f"{name}_valid": valid[channel]}
             if self.stream is not None and not channel:
+                wrench[~valid[0]] = math.nan
                 found[f"{name}_compensated"] = wrench
-                found[f"{name}_compensated_valid"] = valid & np.isfinite(wrench).all(axis=2)
+                found[f"{name}_compensated_valid"] = valid[0] & np.isfinite(wrench).all(axis=2)
         found["imu"] = np.concatenate([found.pop("acceleration"), found.pop("angular_rate")], axis=2)
         return found
 
     def forget(self, before_ns: int) -> None:
         """What windows of this instant and later ones do not need; without this everything is kept."""
         ends = [int(self._ends(np.array([before_ns]), channel)[0]) for channel in range(3)]
-        begin = max(min(ends) - self._length, 0)
-        self._slots = self._slots[begin:].copy()
+        self._slots.take(max(min(ends) - self._length, 0))
 
     def take(self, *, rest: bool) -> Array:
         """The slots that nothing that comes later can change, or the rest; they are in no window then."""
         settled = np.array([self.until_ns - self.doubt_ns - 1])
-        end = len(self._slots) if rest else int(self._ends(settled, 0)[0])
-        taken, self._slots = self._slots[:end], self._slots[end:].copy()
-        return taken
+        return self._slots.take(len(self._slots) if rest else int(self._ends(settled, 0)[0]))
 
     def _ends(self, instants_ns: Ints, channel: int) -> Ints:
         """The slot behind the newest one that was measured before or at each of these instants."""
-        measured = np.maximum.accumulate(self._slots["measured_ns"][:, channel])
-        return np.searchsorted(measured, instants_ns, "right")
+        return np.searchsorted(self._slots.array["latest_ns"][:, channel], instants_ns, "right")

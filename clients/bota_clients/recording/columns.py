@@ -31,27 +31,36 @@ REGISTERS: Final = (
 _TIMES: Final = ("sequence", "stamp_ns", "monotonic_ns")
 _WHOLE: Final = ("flags", "wkc", *REGISTERS)
 _HEADS: Final = HEAD - RECORD_HEAD + file_format.FRAME_SIZE  # of the length of a record
-_VECTORS: Final = {
-    name: [f"{name}.{axis}" for axis in axes]
-    for name, axes in (
-        ("force", "xyz"), ("torque", "xyz"), ("acceleration", "xyz"), ("angular_rate", "xyz"),
-        ("orientation", "xyzw"),
-    )
-}  # fmt: skip
+_VECTORS: Final = {"force": 3, "torque": 3, "acceleration": 3, "angular_rate": 3, "orientation": 4}
+_FRAME: Final = [
+    ("sequence", "<u8"), ("stamp_ns", "<u8"), ("monotonic_ns", "<u8"), ("sensor", "u1"), ("flags", "u1"),
+    ("wkc", "<u2"),
+]  # fmt: skip
+
+
+def _fields(size: int) -> list[tuple[str, str, tuple[int, ...]]]:
+    """Of this much process data, vectors as one."""
+    found = ((each.name.partition("."), "<" + each.type.value) for each in LAYOUTS[size].fields)
+    return [
+        (name, kind, (_VECTORS[name],) if axis else ())
+        for (name, _, axis), kind in found
+        if axis in ("", "x")
+    ]
 
 
 def _record(size: int) -> np.dtype[np.void]:
     """A frame with this much process data as a message in a chunk: heads, frame and fields."""
     heads = [
         ("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("number", "<u4"), ("logged", "<u8"),
-        ("published", "<u8"), ("cdr", "<u4"), ("sequence", "<u8"), ("stamp_ns", "<u8"),
-        ("monotonic_ns", "<u8"), ("sensor", "u1"), ("flags", "u1"), ("wkc", "<u2"), ("size", "<u4"),
+        ("published", "<u8"), ("cdr", "<u4"),
     ]  # fmt: skip
-    return np.dtype([*heads, *((field.name, "<" + field.type.value) for field in LAYOUTS[size].fields)])
+    return np.dtype([*heads, *_FRAME, ("size", "<u4"), *_fields(size)])
 
 
 RECORDS: Final = {size: _record(size) for size in sorted(LAYOUTS)}
 RECORD: Final = RECORDS[max(LAYOUTS)]  # the smaller begins alike
+_ARRIVED: Final = np.dtype([*_FRAME, ("process_data", f"V{max(LAYOUTS)}")])  # fields of a `DataMessage`
+_DECODED: Final = np.dtype([*_FRAME, *_fields(max(LAYOUTS))])
 
 
 def table_of(parts: Sequence[Rows], sensors: npt.NDArray[Any]) -> Table:
@@ -121,7 +130,7 @@ class Columns:
     def empty(cls, count: int) -> Columns:
         """So many rows, to be filled."""
         kinds = {name: RECORD[name] for name in _WHOLE} | dict.fromkeys(_TIMES, np.dtype(np.int64))
-        shapes = {name: (count, len(axes)) for name, axes in _VECTORS.items()}
+        shapes = {name: (count, axes) for name, axes in _VECTORS.items()}
         return cls(**{name: np.empty(shapes.get(name, count), kinds.get(name)) for name in cls.__slots__})
 
     def fill(self, table: Table, imu_units: ImuUnits) -> None:
@@ -131,15 +140,10 @@ class Columns:
         for name in _TIMES:  # 64-bit values that do not fit an int64 are no valid times
             getattr(self, name)[:] = np.minimum(table[name], _MAX)
         self.temperature[:] = table["temperature"]
-        for name, axes in _VECTORS.items():
-            values = getattr(self, name)
-            if axes[0] not in (table.dtype.names or ()):
-                values[:] = math.nan
-                continue
-            for place, axis in enumerate(axes):
-                values[:, place] = table[axis]
-            if name == "orientation":
-                values[~values.any(axis=1)] = math.nan  # all zero: no estimate
+        self.orientation[:] = 0.0
+        for name in _VECTORS.keys() & (table.dtype.names or ()):
+            getattr(self, name)[:] = table[name]
+        self.orientation[~self.orientation.any(axis=1)] = math.nan  # all zero: no estimate
         if imu_units is ImuUnits.G_DPS:
             np.multiply(self.acceleration, STANDARD_GRAVITY, out=self.acceleration)
             np.multiply(self.angular_rate, math.pi / 180.0, out=self.angular_rate)
@@ -154,9 +158,7 @@ class Columns:
 
 def columns(frames: Iterable[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS) -> Columns:
     """Frames of one sensor that are no recording's."""
-    packed = (bytes(HEAD) + file_format.pack_frame(frame) for frame in frames)
-    data = b"".join(each.ljust(RECORD.itemsize, b"\0") for each in packed)
-    return Columns.of(np.frombuffer(data, RECORD), imu_units)
+    return Columns.of(np.array(list(frames), _ARRIVED).view(_DECODED), imu_units)
 
 
 def joined(parts: Sequence[Columns]) -> Columns:

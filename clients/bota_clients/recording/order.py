@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,7 @@ _MAX: Final = (1 << 63) - 1
 
 def in_order(stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     """(n,) The most that can be kept so that each stamp is later than the one before."""
-    if (np.diff(stamps) > 0).all():
+    if (stamps[1:] > stamps[:-1]).all():
         return np.ones(len(stamps), bool)
     return longest_order([stamp] for stamp in stamps.tolist())
 
@@ -61,12 +61,22 @@ class TimeAxis:
 
     def places(self, monotonic_ns: Ints, stamp_ns: Ints) -> Ints:
         """Where the next frames (n,) are, ns."""
-        before, last, stamp = self._before_ns, self._last_ns, self._stamp_ns
-        now, stamps = np.append([before, last], monotonic_ns), np.append(stamp, stamp_ns)
-        fell = np.flatnonzero((now[2:] <= now[:-2]) & (now[1:-1] - now[2:] > _SECOND)).tolist()
+        now = np.concatenate([(self._before_ns, self._last_ns), monotonic_ns])
+        back = now[2:] <= now[:-2]
+        shifts: Any = self.shift_ns
+        if self._undo or back.any():
+            shifts = self._shifts(now, np.append(self._stamp_ns, stamp_ns), back)
+        if len(monotonic_ns):
+            self._before_ns, self._last_ns, self._stamp_ns = int(now[-2]), int(now[-1]), int(stamp_ns[-1])
+        places: Ints = np.minimum(monotonic_ns, _MAX - shifts) + shifts
+        return places
+
+    def _shifts(self, now: Ints, stamps: Ints, back: Bools) -> Ints:
+        """What is added to each of n frames; `now` begins with the two before them, `stamps` with the one."""
+        fell = np.flatnonzero(back & (now[1:-1] - now[2:] > _SECOND)).tolist()
         events = {row + more for row in fell for more in (0, 1)} | ({0} if self._undo else set())
-        shifts, since = np.zeros(len(monotonic_ns), np.int64), 0
-        for row in sorted(events & {*range(len(monotonic_ns))} if events else ()):
+        shifts, since = np.zeros(len(back), np.int64), 0
+        for row in sorted(events & {*range(len(back))}):
             shifts[since:row], since = self.shift_ns, row
             now_ns, last_ns = int(now[row + 2]), int(now[row + 1])
             undo, self._undo = self._undo, None
@@ -79,26 +89,27 @@ class TimeAxis:
                 passed_ns = max(_SECOND, int(stamps[row + 1] - stamps[row]))
                 self.shift_ns = min(self.shift_ns + last_ns - now_ns + passed_ns, _MAX)
         shifts[since:] = self.shift_ns
-        if len(monotonic_ns):
-            self._before_ns, self._last_ns = now[-2:].tolist()
-            self._stamp_ns = int(stamps[-1])
-        return np.minimum(monotonic_ns, _MAX - shifts) + shifts
+        return shifts
 
     def is_later(self, places: Ints, sensor: int = 0) -> Bools:
         """(n,) Which of a sensor's next samples, at these places, come in order; counts the others."""
         newest_ns = self._newest_ns.get(sensor, -1)
-        found = in_order(np.append(newest_ns, places))[1:] & (places > newest_ns)
-        self._newest_ns[sensor] = int(places[found].max(initial=newest_ns))
-        self.left_out += int((~found).sum())
+        found = in_order(np.concatenate([(newest_ns,), places]))
+        is_whole, found = found.all(), found[1:]
+        if not is_whole:
+            found &= places > newest_ns
+            self.left_out += int((~found).sum())
+        self._newest_ns[sensor] = int((places if is_whole else places[found])[-1:].max(initial=newest_ns))
         return found
 
     def batches(self, batches: Iterable[tuple[InForce, Columns]]) -> Iterator[tuple[InForce, Columns]]:
         """Those of one sensor with their places as `monotonic_ns`, without samples out of order."""
         for in_force, batch in batches:
-            places, is_kept = self.places(batch.monotonic_ns, batch.stamp_ns), np.ones(len(batch), bool)
-            found, is_later = replace(batch, monotonic_ns=places), self.is_later(places[batch.fresh])
+            places, fresh = self.places(batch.monotonic_ns, batch.stamp_ns), batch.fresh
+            found, is_later = replace(batch, monotonic_ns=places), self.is_later(places[fresh])
             if not is_later.all():
-                is_kept[batch.fresh] = is_later
+                is_kept = ~fresh
+                is_kept[fresh] = is_later
                 found = found.where(is_kept)
             if len(found):
                 yield in_force, found
