@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
 from pathlib import Path
 from xml.etree import ElementTree
 
+import pytest
 import xacro
 from catkin_pkg.package import parse_package
 
-from tests.clients.cpp_programs import ROOT
+from tests.clients.cpp_programs import INCLUDE as CLIENT
+from tests.clients.cpp_programs import ROOT, needs_gxx
 
 PACKAGE = ROOT / "clients" / "ros2_control"
 INCLUDE = PACKAGE / "include" / "bota_ethercat_hardware"
@@ -65,3 +69,26 @@ def test_the_macro_lists_what_is_asked_for(tmp_path: Path) -> None:
         assert len(set(listed)) == len(listed)
         assert set(listed) == set(SIGNALS if flag == "true" else [*SIGNALS[:6], "age", "condition"])
         assert [(p.get("name"), p.text) for p in robot.iter("param")] == [("port", "12002")]
+
+
+@needs_gxx
+@pytest.mark.timeout(300)
+def test_the_plugin_compiles_against_the_ros2_control_that_is_installed() -> None:
+    """Of any release, as its interface changes; what is deprecated in the newest is an error here."""
+    prefixes = map(Path, filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)))
+    found = [folder for prefix in prefixes for folder in (prefix / "include").glob("*")]
+    if not any((folder / "hardware_interface").is_dir() for folder in found):
+        pytest.skip("no ros2_control here: source a ROS 2 that has ros-jazzy-ros2-control or newer")
+    options = [
+        "-std=c++17",
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        "-fsyntax-only",
+        f"-I{CLIENT}",
+        f"-I{INCLUDE.parent}",
+    ]
+    system = [option for folder in found for option in ("-isystem", str(folder))]
+    source = PACKAGE / "src" / "force_torque_sensor.cpp"
+    compiled = subprocess.run(["g++", *options, *system, source], capture_output=True, text=True, check=False)
+    assert not compiled.returncode, compiled.stderr
