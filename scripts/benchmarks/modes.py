@@ -44,7 +44,7 @@ PYSOEM, KICKCAT, DRIVER, ROS = "pysoem", "KickCAT", "Bota's driver", "this, ROS"
 _POLLERS: Final[Mapping[str, Sequence[object]]] = {
     PYSOEM: (sys.executable, "-m", f"{PROCESSES}.poller", "pysoem"),
     KICKCAT: (*_OTHER, f"{PROCESSES}.poller", "kickcat"),
-    DRIVER: (*_OTHER, f"{PROCESSES}.vendor_driver"),
+    DRIVER: (*_OTHER, f"{PROCESSES}.poller", "bota_driver"),
 }
 _PACKAGES: Final = {KICKCAT: "kickcat", DRIVER: "bota-driver"}  # of scripts/benchmark --vendor
 RATIOS: Final = {
