@@ -146,6 +146,25 @@ def test_the_yaml_is_what_the_node_takes(recording: Path, tmp_path: Path) -> Non
     assert "cannot be written" in refused(recording, "--yaml", tmp_path / "no" / "x.yaml")
 
 
+def test_the_bias_is_that_of_the_sensors_last_offset_which_the_file_names(tmp_path: Path) -> None:
+    """Tared after half of the poses."""
+    tared = [5.0, -4.0, 3.0, 0.1, -0.2, 0.3]
+    described, half, later = describe(0), len(posed()) // 2, list[DataMessage]()
+    described["sensors"][0] |= {"settings": start_up_defaults() | {"sinc_length": SINC}, "offset": [*OFFSET]}
+    for each in posed()[half:]:
+        data = bytearray(each.process_data)
+        measured = struct.unpack_from("<6f", data, 5)
+        shifted = [m + now - was for m, now, was in zip(measured, tared, OFFSET, strict=True)]
+        struct.pack_into("<6f", data, 5, *shifted)
+        later.append(each._replace(process_data=bytes(data)))
+    told = {"event": "offset_changed", "sensor": 0, "offset": tared}
+    write(tmp_path / "run.mcap", [described, *posed()[:half], told, *later])
+    code, answer, _ = asked(tmp_path / "run.mcap", "--yaml", tmp_path / "tool.yaml")
+    assert code == 0
+    assert answer["bias"] == pytest.approx(tared, abs=0.05)
+    assert written_parameters(tmp_path / "tool.yaml")["sensor_offset"] == pytest.approx(tared)
+
+
 def test_other_frames_and_bad_samples_do_not_matter(tmp_path: Path) -> None:
     """Repeated frames, another sensor, and a saturated sample within a pose."""
     noise = random.Random(1)

@@ -81,7 +81,8 @@ def turn(
     reach_s = period * len(taps) + abs(lag_s) + _WINDOW_S
     moved, found, instants = list[tuple[Array, ...]](), list[Array](), list[Array]()
     for stretch in stretches(stamps, max(alignment.gap_s, 2.5 * period)):
-        begin_s, *_, end_s = own = stamps[stretch]
+        own = stamps[stretch]
+        begin_s, end_s = own[[0, -1]]  # of a single sample too
         if end_s - begin_s < reach_s + 4 * _WINDOW_S:
             continue
         times = np.arange(begin_s, end_s, period)
