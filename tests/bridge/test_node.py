@@ -258,15 +258,6 @@ def test_arguments_that_are_not_understood(capsys: pytest.CaptureFixture[str]) -
         assert said.count("\n") == 1
 
 
-def test_without_home_it_says_so(start_process: StartProcess, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a process: rclpy is loaded once in one."""
-    for name in ("HOME", "ROS_HOME", "ROS_LOG_DIR"):
-        monkeypatch.delenv(name, raising=False)
-    node = start_process(12001)
-    assert node.ends() == 1
-    assert "set HOME, or ROS_LOG_DIR to a directory for its log" in node.log.splitlines()[-1]
-
-
 def test_a_signal_at_start_is_no_traceback(server: ScriptedServer, start_process: StartProcess) -> None:
     """In a process: signals are a process's."""
     node = start_process(server.port)

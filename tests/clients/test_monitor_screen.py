@@ -15,6 +15,7 @@ from bota_clients.monitor.words import json_line
 from bota_ethercat.framing import DataMessage
 from tests.clients import monitor_states as made
 from tests.clients.pictures import AGAIN, DOCS, captures
+from tests.golden_vectors import odd_messages
 
 STATES = {"healthy": made.healthy, "troubled": made.troubled, "gone": made.gone}
 
@@ -110,10 +111,13 @@ def _texts(svg: str) -> list[str]:
     return [f"{text} {styles[name]}" for name, text in found]
 
 
-def test_whatever_a_sensor_sends_is_shown() -> None:
+def test_whatever_a_server_says_and_a_sensor_sends_is_shown() -> None:
     noise = random.Random(1)
     model = Model(made.ADDRESS)
     made.connect(model, made.description(), made.OWN_PEER, made.START_S)
+    for message in odd_messages():
+        made.happen(model, message, made.START_S)
+        model.add_status(message, made.START_S)
     for k in range(120):
         data = noise.randbytes(77)
         sequence, stamp_ns, monotonic_ns = (noise.getrandbits(64) for _ in range(3))

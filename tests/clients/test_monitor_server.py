@@ -31,7 +31,6 @@ from bota_ethercat.client import Client
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import ScriptedServer
 from tests.clients.running import frames_in, signalled
-from tests.golden_vectors import odd_messages
 from tests.served_simulation import ServedSimulation, served
 from tests.server.running import PATIENCE_S, free_port, wait_until
 from tests.simulation import simulated_bus, simulated_server
@@ -315,19 +314,3 @@ def test_a_restart_of_the_server_is_seen_and_survived() -> None:
             wait_until(lambda: state(model).server.connected, "a new connection")
             wait_until(lambda: samples(model) > 20, "samples again")
             wait_until(lambda: not any(sensor.old_s for sensor in state(model).sensors), "fresh ones")
-
-
-def test_whatever_the_server_says_the_reader_goes_on() -> None:
-    with ScriptedServer() as server:
-        model = Model("scripted")
-        reader = MonitorReader(Address("localhost", server.port), model, batch_s=0.01)
-        reader.start()
-        try:
-            assert server.subscribed.wait(PATIENCE_S)
-            for message in odd_messages():
-                server.send_json(message)
-            server.send_sample(1.0)
-            wait_until(lambda: samples(model) or not reader.is_alive(), "the sample")
-            assert reader.is_alive()
-        finally:
-            reader.close()
