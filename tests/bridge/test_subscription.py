@@ -42,8 +42,7 @@ class Subscriber:
         self._sources = {"receive": node.hear(topic), "published": node.hear("bridge/published")}
         self._queues: dict[str, deque[Any]] = {name: deque() for name in self._sources}
         self.counted = Subscription(node.name.removesuffix("bridge") + topic)
-        self.dropped, self.dropping = 0, 0.0
-        self.is_matched = False
+        self.dropped, self.dropping, self.is_matched = 0, 0.0, True
         self.events: list[Event] = []
 
     def step(self) -> None:
@@ -66,14 +65,14 @@ class Subscriber:
         getattr(self.counted, name)(argument, *more)
         assert self.counted.lost >= before, "each report is right by itself"
 
-    def run(self, seconds: float) -> None:
+    def run(self, seconds: float, dropping: float = 0.0) -> None:
+        self.dropping = dropping
         for _ in range(round(seconds / STEP_S)):
             self._node.step()
             self.step()
 
     def finish(self) -> int:
         """What was lost, once nothing is under way."""
-        self.dropping = 0.0
         self.run(1.0)
         for name in ("published", "receive"):
             while self._queues[name]:
@@ -101,15 +100,15 @@ def test_lost_messages_are_counted_to_the_sample(topic: str, seed: int) -> None:
     server.step = step  # type: ignore[method-assign]
     with Node(server) as node:
         subscriber = Subscriber(node, topic, seed)
+        subscriber.is_matched = False
         subscriber.run(1.0)  # published for others, before this one is matched
         subscriber.is_matched = True
         subscriber.run(1.0)
-        subscriber.dropping = 0.3
-        subscriber.run(3.0)
+        subscriber.run(3.0, dropping=0.3)
         node.set("publishing_frequency", 30.0)
-        subscriber.run(2.0)
+        subscriber.run(2.0, dropping=0.3)
         node.set("publishing_frequency", 0.0)
-        subscriber.run(1.0)
+        subscriber.run(1.0, dropping=0.3)
         lost = subscriber.finish()
     assert lost == subscriber.dropped > 50
     assert subscriber.counted.received > 100
@@ -141,14 +140,11 @@ def test_what_was_lost_on_the_bus_is_missing_but_not_lost() -> None:
     server = Server()
     with Node(server) as node:
         subscriber = Subscriber(node, "wrench", 3)
-        subscriber.is_matched = True
         subscriber.run(1.5)
         for _ in range(7):
             server.now_ns += round(STEP_S * 1e9)
         subscriber.run(1.0)
-        subscriber.dropping = 1
-        subscriber.run(0.05)
-        subscriber.dropping = 0
+        subscriber.run(0.05, dropping=1.0)
         subscriber.run(0.5)
         assert (subscriber.finish(), subscriber.counted.missing) == (5, 12)
 
@@ -157,12 +153,10 @@ def test_it_begins_anew_with_a_clock_that_is_set_back_and_a_node_that_starts_ane
     server = Server()
     with Node(server) as node:
         subscriber = Subscriber(node, "wrench", 5)
-        subscriber.is_matched = True
         subscriber.run(1.0)
         server.clock_step_ns = -3 * 10**9
         subscriber.run(1.0)
-        subscriber.dropping = 0.5
-        subscriber.run(1.0)
+        subscriber.run(1.0, dropping=0.5)
         before = subscriber.finish()
         assert before == subscriber.dropped > 30
         received = subscriber.counted.received
@@ -171,10 +165,8 @@ def test_it_begins_anew_with_a_clock_that_is_set_back_and_a_node_that_starts_ane
     with Node(server) as node:
         other = Subscriber(node, "wrench", 6)
         counted._topic, other.counted = other.counted._topic, counted
-        other.is_matched = True
         other.run(1.0)
-        other.dropping = 0.5
-        other.run(1.0)
+        other.run(1.0, dropping=0.5)
         assert other.finish() - before == other.dropped > 30
         assert counted.received > received + 100
 
@@ -192,12 +184,10 @@ def test_cpp_counts_the_same(tmp_path: Path) -> None:
     server = Server()
     with Node(server) as node:
         subscriber = Subscriber(node, "wrench", 7)
-        subscriber.is_matched = True
         subscriber.run(1.0)
-        subscriber.dropping = 0.3
-        subscriber.run(2.0)
+        subscriber.run(2.0, dropping=0.3)
         server.clock_step_ns = -(10**9)
-        subscriber.run(2.0)
+        subscriber.run(2.0, dropping=0.3)
         subscriber.finish()
         name = f"{node.name.removesuffix('bridge')}wrench"
     lines = [name]
