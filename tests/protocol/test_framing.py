@@ -1,7 +1,7 @@
 """Messages, framed and as bare JSON lines: whole, in pieces, together, oversized, hostile.
 
-Whatever bytes arrive: only documented errors, bounded memory, nothing valid lost, however they are cut. That
-framed messages may be cut at every byte is tested with the golden vectors.
+Whatever bytes arrive: only documented errors, bounded memory, nothing valid lost, however they are cut. The
+bytes of framed messages, which may be cut anywhere, and what is no message are in the golden vectors.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 from bota_ethercat.control import ACTIONS, ErrorCode, error_reply, parse_request, reply
 from bota_ethercat.errors import BadMessageError, ProtocolError, RemoteProtocolError, RequestError
 from bota_ethercat.framing import (
-    DATA_FLAGS_OFFSET,
     MAX_DATA_MESSAGE_SIZE,
     MAX_JSON_LENGTH,
     DataFlag,
@@ -93,19 +92,10 @@ def kinds(found: Sequence[Outcome]) -> list[object]:
 # -- framed
 
 
-def test_messages_on_the_wire_are_as_the_contract_says() -> None:
-    wire = encode_data(*SAMPLE)
-    assert wire == struct.pack(
-        ">IBQQQBBH", 90, 1, 7, 1_700_000_000_000_000_000, 123_456_789, 3, 4, 3
-    ) + bytes(range(61))  # fmt: skip
-    assert wire[DATA_FLAGS_OFFSET] == DataFlag.GAP
-    assert len(encode_data(*WITH_ORIENTATION)) == MAX_DATA_MESSAGE_SIZE == 110
-    assert encode_json({"action": "shutdown"}) == b'\x00\x00\x00\x16\x02{"action":"shutdown"}'
-
-
 def test_reading_into_the_decoders_own_buffer_and_the_longest_message() -> None:
     longest = {"a": "x" * (MAX_JSON_LENGTH - 8)}
     messages: list[Any] = [SAMPLE, JSON, WITH_ORIENTATION, {}, longest, SAMPLE]
+    assert len(encode(WITH_ORIENTATION)) == MAX_DATA_MESSAGE_SIZE
     decoder, got, rest = FrameDecoder(), [], b"".join(map(encode, messages)) * 100
     while rest:
         with decoder.get_buffer() as buffer:
@@ -120,15 +110,10 @@ def test_reading_into_the_decoders_own_buffer_and_the_longest_message() -> None:
 @pytest.mark.parametrize(
     ("decoder", "wire", "words"),
     [
-        (FrameDecoder(), struct.pack(">I", 0), "length 0"),
-        (FrameDecoder(), struct.pack(">I", MAX_JSON_LENGTH + 2), "length"),
-        (FrameDecoder(), b"\xff\xff\xff\xff", "length"),
         (FrameDecoder(), b"GET / HTTP/1.1\r\n", "length"),
-        (FrameDecoder(), struct.pack(">IB", 5, 0), "type 0"),
         (FrameDecoder(), struct.pack(">IB", 5, 4), "type 4"),
         (FrameDecoder(), struct.pack(">IB", 28, 3), "TERMINAL message of length"),
         (FrameDecoder(), struct.pack(">IB", 90 - 1, 1), "DATA message of length"),
-        (FrameDecoder(), struct.pack(">IB", 1, 1), "DATA message of length"),
         (FrameDecoder(max_json_length=80), encode_data(*SAMPLE) + struct.pack(">IB", 82, 2), "JSON"),
         (FrameDecoder(accepts=(MessageType.JSON,)), encode_data(*SAMPLE), "type 1"),
     ],
@@ -144,18 +129,6 @@ def test_what_is_no_message_ends_it_for_good(decoder: FrameDecoder, wire: bytes,
     decoder.feed(encode_json(JSON))
     with pytest.raises(RemoteProtocolError, match=words):
         decoder.next_message()
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        b"", b"[]", b"null", b"1", b'"x"', b"{", b'{"a":}', b"\xff\xfe", b'{"a":NaN}', b'{"a":Infinity}',
-        b'{"a":-Infinity}', b"{} {}", b"[" * 16000, b'{"a":' * 40 + b"1" + b"}" * 40,
-        b'{"a":' + b"9" * 5000 + b"}",
-    ],
-)  # fmt: skip
-def test_a_message_that_is_no_object_costs_only_itself(text: bytes) -> None:
-    assert kinds(outcomes(client_side(), [framed(text) + encode_json(JSON)])) == ["bad", JSON]
 
 
 u64 = st.integers(0, 2**64 - 1)
