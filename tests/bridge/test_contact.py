@@ -79,8 +79,3 @@ def test_it_tells_the_point_and_only_while_there_is_contact() -> None:
         assert len({stamp_ns(each) for each in points}) == len(points)
         press((0.0, 0.0, 0.0))
         assert not detected[-1].data
-
-
-def test_without_a_surface_there_is_no_topic() -> None:
-    with Node(Server()) as node:
-        assert not [name for name in node.topics if "contact" in name]

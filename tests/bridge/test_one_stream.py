@@ -214,7 +214,7 @@ def plugin(stream: Stream, folder: Path) -> Iterator[tuple[int, Found]]:
             if isinstance(item, End):
                 played.description, was = item.description, played.connections
                 played.drop()
-                _wait_for_another(played, was)
+                wait_until(lambda: played.connections > was and bool(played.streams), "a connection")  # noqa: B023
             elif isinstance(item, DataMessage):
                 seen = _sent(loop, played, item)
                 if item.sensor == 0 and not item.flags & NOT_NEW:
@@ -230,10 +230,6 @@ def plugin(stream: Stream, folder: Path) -> Iterator[tuple[int, Found]]:
     finally:
         played.close()
         assert end_driver(loop.process) == 0
-
-
-def _wait_for_another(server: ScriptedServer, before: int) -> None:
-    wait_until(lambda: server.connections > before and bool(server.streams), "a connection")
 
 
 def _sent(loop: Loop, server: ScriptedServer, frame: DataMessage) -> Any:

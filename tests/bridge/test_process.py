@@ -247,36 +247,25 @@ def test_a_thread_that_fails_says_so() -> None:
 # Executors run until they are told to stop.
 
 
-@pytest.fixture
-def node() -> Iterator[Any]:
-    made = rclpy.create_node("spinning")
-    yield made
-    made.destroy_node()
-
-
 def test_a_host_that_does_not_answer_is_said_so(start_process: StartProcess) -> None:
     """Connecting is pending: a process, because only the kernel leaves it so."""
     with full_listener() as port:
         start_process(port).says(f"no server at localhost:{port} (Connection timed out)")
 
 
-@pytest.fixture
-def executor(node: Any) -> Iterator[SingleThreadedExecutor]:
-    made = SingleThreadedExecutor()
-    made.add_node(node)
-    yield made
-    made.shutdown()
-
-
-def test_a_callback_that_raises_ends_it_and_is_told(executor: SingleThreadedExecutor, node: Any) -> None:
+def test_a_callback_that_raises_ends_it_and_is_told() -> None:
     def fail() -> Any:
         raise LookupError("of the callback")
 
+    node, executor = rclpy.create_node("spinning"), SingleThreadedExecutor()
+    executor.add_node(node)
     node.create_timer(0.001, fail)
     spinner = Spinner(executor)
     with pytest.raises(LookupError, match="of the callback"):
         spinner.run()
     spinner.stop()
+    executor.shutdown()
+    node.destroy_node()
 
 
 # The profile for Fast DDS.
