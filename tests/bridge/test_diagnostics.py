@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import operator
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,10 +11,9 @@ import rclpy
 
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import encode
-from bota_ethercat.sensor.warnings_register import WARNINGS
 from bota_ethercat_bridge.diagnostics import text_of
 from tests.bridge.real_node import retire
-from tests.bridge.simulated_node import HEALTHY, SETTINGS, Node, Server, level, status, values
+from tests.bridge.simulated_node import HEALTHY, Node, Server, level, status, values
 from tests.compensation.making import written_parameters
 from tests.server.running import wait_until
 
@@ -89,28 +86,14 @@ def test_it_is_published_every_second_and_at_once_when_a_level_changes(node: Nod
     assert len(arrays) == 1
 
 
-def test_warning_bits_of_one_frame_each_are_told_once(node: Node, server: Server) -> None:
-    for row in WARNINGS:
-        server.once(process_data=encode(61, {"warnings": row.flag}))
-    told = []
-
-    def all_are_told() -> bool:
-        told.append(node.statuses()["sensor"])
-        wanted = [f"{row.meaning}: {row.remedy[0].lower()}{row.remedy[1:]}" for row in WARNINGS]
-        return all(any(words in one.message for one in told) for words in wanted)
-
-    node.run_until(all_are_told, "each bit")
-    registers = [int(values(one)["warnings_register"], 16) for one in told]
-    assert functools.reduce(operator.or_, registers) == 0x7F
-    assert "error" in [level(one) for one in told]
-    assert node.until(sensor="ok")["sensor"].message == "as it should be"
-
-
-def test_saturation_and_heat(node: Node, server: Server) -> None:
+def test_saturation_warnings_and_heat(node: Node, server: Server) -> None:
     for _ in range(3):
         server.once(process_data=encode(61, {"force_torque_saturated": 0b101}))
-    array = node.until("Force/torque (ADC) saturated: Fx, Fz", sensor="error")
-    assert values(array["sensor"])["saturated_samples"] == "3"
+    for warnings in (8, *(0,) * 15, 32):  # of one frame each, told together
+        server.once(process_data=encode(61, {"warnings": warnings}))
+    array = node.until("Force/torque (ADC) saturated: Fx, Fz", "out of sync", "Overtemp", sensor="error")
+    told = values(array["sensor"])
+    assert (told["saturated_samples"], told["warnings_register"]) == ("3", "0x00000028")
     node.until(sensor="ok")
     server.changes = {"process_data": encode(61, {"temperature": 85.0})}
     node.until("85.0 °C", sensor="error")
@@ -142,15 +125,6 @@ def test_lost_samples_are_counted(node: Node, server: Server) -> None:
     server.answers["status"] = lambda _: status(lost_samples=11)
     array = node.until("11 of ", " were lost", stream="error")
     assert values(array["stream"])["server_lost"] == "11"
-
-
-def test_a_change_says_the_rate_that_its_settings_do_not(node: Node, server: Server) -> None:
-    server.answers["describe"] = lambda _: None
-    for settings, rate_hz in ((SETTINGS, 50), ({**SETTINGS, "chop": True}, None), (SETTINGS, "fast")):
-        message = {"event": "reconfigured", "sensor": 0, "settings": settings, "rate_hz": rate_hz}
-        server.send_json(message)
-        node.run(0.1)
-        assert node.node.reader.link.info.rate_hz == 50
 
 
 def test_what_is_wrong_with_the_stream(node: Node, server: Server) -> None:
