@@ -615,33 +615,36 @@ def test_emergencies_are_told_at_a_bounded_rate_and_all_are_counted(caplog: pyte
             known.note(number, Emergency(code, 0x81, b"\1\2"))
         return told
 
-    assert note(0x4210, 0x4210, 0x12) == [(1, 0x4210, 1), (1, 0x12, 3)]
-    assert [record.levelname for record in caplog.records] == ["WARNING", "WARNING", "INFO"]
-    assert caplog.messages[-2] == (
+    assert note(0x4210, 0x4210, 0x12, 0x4210) == [(1, 0x4210, 1), (1, 0x12, 3), (1, 0x4210, 4)]
+    assert [record.levelname for record in caplog.records] == ["WARNING", "WARNING", "INFO", "WARNING"]
+    assert caplog.messages[-1] == (
         "sensor 1 reports emergency 0x4210 (temperature), error register 0x81, data 0102"
     )
-    assert [code for _, code, _ in note(*range(0x5001, 0x5007))] == [0x5001, 0x5002, 0x5003]
+    assert [code for _, code, _ in note(*range(0x5001, 0x5007))] == [0x5001, 0x5002]
     assert note(0x4210, number=2) == [(2, 0x4210, 1)]
     clock.sleep(0.999)
     assert note(0x5010) == []
     clock.sleep(0.001)
-    assert note(0x5011, 0x5012) == [(1, 0x5011, 11)]
+    assert note(0x5011, 0x5012) == [(1, 0x5011, 12)]
     clock.sleep(9.999)
     assert note(0x5011) == []
     clock.sleep(0.001)
-    assert note(0x5011) == [(1, 0x5011, 14)]
+    assert note(0x5011) == [(1, 0x5011, 15)]
     clock.sleep(100.0)
     assert len(note(*range(0x6000, 0x6009))) == 5
-    texts = [Emergency(code, 0, b"").text for code in (0x00FF, 0x5123, 0x8FFF, 0x81FF, 0xB001)]
-    hardware, none = "hardware of the device", "of no class that CiA 301 defines"
-    assert texts == ["error reset, or no error", hardware, "monitoring", "communication", none]
+    texts = {
+        0x00FF: "error reset, or no error", 0x5123: "hardware of the device", 0x8FFF: "monitoring",
+        0x81FF: "communication", 0xFF07: "device-specific", 0xB001: "of no class that CiA 301 defines",
+    }  # fmt: skip
+    assert {code: Emergency(code, 0, b"").text for code in texts} == texts
+    assert [code for code in texts if Emergency(code, 0, b"").is_reset] == [0x00FF]
     clock.sleep(1.2344)
     last = {"code": 0x6008, "text": "software of the device", "register": 0x81, "data": "0102"}
-    assert known.status(1) == {"emergencies": 23, "emergency": {**last, "ago_s": 1.234}}
-    assert note(0x6008) == [(1, 0x6008, 24)]
+    assert known.status(1) == {"emergencies": 24, "emergency": {**last, "ago_s": 1.234}}
+    assert note(0x6008) == [(1, 0x6008, 25)]
     clock.sleep(0.5)
     assert note(0x6008) == []
-    assert known.status(1) == {"emergencies": 25, "emergency": {**last, "ago_s": 0.0}}
+    assert known.status(1) == {"emergencies": 26, "emergency": {**last, "ago_s": 0.0}}
 
 
 @pytest.mark.parametrize(
