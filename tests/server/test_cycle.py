@@ -337,17 +337,6 @@ def test_status_distributions_count_every_cycle() -> None:
     assert 0 < status["sensors"][0]["age_us"]["p50"] < PERIOD_NS / 1000
 
 
-def test_a_run_is_repeated_by_its_seed() -> None:
-    def run(seed: int) -> list[tuple[int, int, int]]:
-        running = simulation(Machine(seed=seed, lost=0.02, stall_every_s=0.3, stall_ns=5e6))
-        running.at(0.4, "power cycle 0.2")
-        running.run(1.0)
-        return [(frame.sequence, frame.stamp_ns, frame.flags) for frame in running.frames]
-
-    assert run(1) == run(1)
-    assert run(1) != run(2)
-
-
 @pytest.mark.parametrize(
     ("seed", "dc"),
     more_if_long([(4, "none"), (23, "")], [(4, "none"), *((n, "") for n in range(1, 25))]),
