@@ -645,24 +645,3 @@ def test_emergencies_are_told_at_a_bounded_rate_and_all_are_counted(caplog: pyte
     clock.sleep(0.5)
     assert note(0x6008) == []
     assert known.status(1) == {"emergencies": 26, "emergency": {**last, "ago_s": 0.0}}
-
-
-@pytest.mark.parametrize(
-    ("areas", "is_refused"),
-    [
-        (((0x1000, 128), (0x1080, 128)), False),
-        (((0x1000, 0), (0x1080, 0)), False),
-        (((0x1000, 16), (0x1080, 1486)), False),
-        (((0x1000, 15), (0x1080, 128)), True),
-        (((0x1000, 128), (0x1080, 1487)), True),
-    ],
-)
-def test_mailboxes_that_no_frame_can_carry(areas: Any, is_refused: bool) -> None:
-    with contextlib.nullcontext() if not is_refused else pytest.raises(BusError) as error:
-        MailboxSdo(cast(Bus, GivenBus()), 3, areas)
-    if is_refused:
-        assert error is not None
-        assert str(error.value) == (
-            f"sensor 3 has mailboxes of {areas[0][1]} and {areas[1][1]} bytes, which no frame can carry: "
-            "power it off and on"
-        )

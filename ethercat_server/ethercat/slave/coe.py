@@ -22,8 +22,6 @@ from ethercat_server.ethercat.datagrams import Registers, Steps, T
 
 log = logging.getLogger(__name__)
 
-_SHORTEST: Final = 16
-_LONGEST: Final = 1486
 _HEADER: Final = struct.Struct("<HHBB")
 _TYPE_COE: Final = 3
 _SDO_HEADER: Final = struct.Struct("<HBHB")
@@ -244,11 +242,6 @@ class MailboxSdo:
         self._name = name or f"sensor {number}"
         self.clock = bus.clock
         (self._out, self._out_size), (self._in, self._in_size) = areas
-        if not all(size == 0 or _SHORTEST <= size <= _LONGEST for _, size in areas):  # 0: it has none
-            raise BusError(
-                f"{self._name} has mailboxes of {self._out_size} and {self._in_size} bytes, which no "
-                "frame can carry: power it off and on"
-            )
         self._counter = 0
         self._in_use = False
         # Until when it is certain that the slave takes the next counter, and that no late answer comes.
