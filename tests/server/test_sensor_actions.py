@@ -145,12 +145,8 @@ def test_a_setting_that_is_written_as_an_object_is_told_to_all(bench: Bench) -> 
         ("sdo_write", {"index": OFFSET, "subindex": -1, "hex": "00"}, "'subindex'"),
         ("sdo_write", {"hex": "00"}, "needs the key 'index'"),
         ("configure", {"settings": {}}, "an object with settings"),
-        ("configure", {"settings": {"fir": 1}}, "fir is 1"),
-        ("configure", {"settings": {"sinc_length": 50000}}, "sinc_length is 50000: it must be"),
         ("configure", {"settings": {"colour": 1}}, "no setting 'colour': the settings are calib"),
-        ("configure", {"settings": {"sinc": 128}}, "did you mean 'sinc_length'?"),
         ("configure", {"settings": {"fast": True}}, "fast is true but fir is false"),
-        ("configure", {"settings": {"fir": True, "acceleration_range_g": 3}}, "must be one of 2, 4, 8, 16"),
         ("tare", {"samples": 20, "target": [1e300, 0, 0, 0, 0, 0]}, "'target' cannot be"),
     ],
 )  # fmt: skip
