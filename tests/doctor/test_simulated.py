@@ -50,12 +50,6 @@ def single() -> Iterator[SimulatedBus]:
         yield bus
 
 
-def assert_left_as_they_were(bus: SimulatedBus) -> None:
-    for position in range(2):
-        now = bus.stats(position)
-        assert (now["al_state"], now["al_error"], now["sdo_write_count"]) == ("INIT", False, 0)
-
-
 def test_what_is_found_and_measured_and_left_as_it_is(bench: SimulatedBus, tmp_path: Path) -> None:
     announced: list[str] = []
     findings = examined(bench, tmp_path, 1.0, announce=announced.append)
@@ -77,7 +71,9 @@ def test_what_is_found_and_measured_and_left_as_it_is(bench: SimulatedBus, tmp_p
     assert age["p50"] > exchange["p50"] / 2
     assert findings.levels("measurement")["bus meanwhile"] == "ok"
     assert announced == ["measuring for 1 s ..."]
-    assert_left_as_they_were(bench)
+    for position in range(2):
+        now = bench.stats(position)
+        assert (now["al_state"], now["al_error"], now["sdo_write_count"]) == ("INIT", False, 0)
 
 
 def test_a_machine_that_stalls_shows_in_the_measurement(single: SimulatedBus, tmp_path: Path) -> None:

@@ -395,7 +395,7 @@ IMU = BY_SETTING["imu_active"].address
 
 
 class NoBus:
-    """Whatever is done on it has no time to be in time for; each look at the exchanges finds one more."""
+    """Each look at the exchanges finds one more."""
 
     clock = SYSTEM_CLOCK
 
@@ -405,10 +405,6 @@ class NoBus:
     @property
     def answered(self) -> int:
         return next(self._answered)
-
-    @contextlib.contextmanager
-    def in_time(self, _until_ns: int) -> Iterator[None]:
-        yield
 
 
 class ScriptedSdo:

@@ -74,10 +74,6 @@ def held(bench: Bench, index: int, subindex: int) -> int:
     return int(bench.ask("sdo_read", index=index, subindex=subindex)["hex"], 16)
 
 
-def only_reconfigured(bench: Bench) -> bool:
-    return {event["event"] for event in bench.listener.events} <= {"reconfigured"}
-
-
 # -- objects
 
 
@@ -635,7 +631,7 @@ def test_an_abort_half_way(bench: Bench, settings: dict[str, Any], what: str, sa
     assert said in refused["message"]
     assert refused["message"].endswith("; the former settings are in force")
     check_former(bench, before)
-    assert only_reconfigured(bench)
+    assert {event["event"] for event in bench.listener.events} <= {"reconfigured"}
 
 
 @pytest.mark.parametrize(
