@@ -516,9 +516,10 @@ def noise(seed: int, deviation: float) -> Iterator[float]:
 
 
 def test_fewer_samples_than_show_rest_are_not_taken() -> None:
-    force = iter(range(1000))
-    with pytest.raises(RequestError, match="Fx varies by"):
-        run_tare(ScriptedSdo(), 1, [0.0] * 6, (float(n) for n in force))
+    sdo, force = ScriptedSdo(), iter(range(1000))
+    with pytest.raises(RequestError, match="sensor 0 is not at rest: Fx varies by") as refused:
+        run_tare(sdo, 1, [0.0] * 6, (float(n) for n in force))
+    assert (refused.value.code, sdo.written) == (ErrorCode.NOT_READY, [])
     assert next(force) >= 20
 
 

@@ -453,13 +453,6 @@ def test_tare_makes_the_mean_the_target(bench: Bench) -> None:
     assert len(bench.listener.fresh(50)) == 50
 
 
-def test_a_sensor_that_moves_is_not_tared(streaming: Bench) -> None:
-    refused = streaming.refused("tare", samples=50)
-    assert refused["code"] == "not_ready"
-    assert "not at rest" in refused["message"]
-    assert offset(streaming)[0] == 0
-
-
 @pytest.mark.parametrize("bit", range(7))
 def test_a_sensor_that_says_that_it_must_not_be_used_is_not_tared(bench: Bench, bit: int) -> None:
     """By the warnings register alone; of an overtemperature, and of the accelerometer, all the same."""
@@ -523,16 +516,6 @@ def test_a_tare_has_the_time_that_its_samples_take() -> None:
     bench = Bench(settings={"sinc_length": 2048})
     assert bench.described()["rate_hz"] == 25
     assert bench.ask("tare", samples=100)["ok"]
-
-
-def test_noise_does_not_make_a_tare_worse(bench: Bench) -> None:
-    """It is on target already, so that each of these may be somewhat worse by chance."""
-    for channel, deviation in (("force.x", 0.5), ("force.z", 0.1), ("torque.y", 0.015)):
-        bench.command(f"noise {channel} {deviation}")
-    for samples in (20, 200):
-        for _ in range(5):
-            tared = bench.ask("tare", samples=samples)
-            assert tared["ok"], tared
 
 
 # -- for half a second after a sensor has entered OP its data settles: the stream does not wait, a tare does
