@@ -8,7 +8,6 @@ Sources: ETG.1000.6 (abort codes: table "SDO Abort Codes"), CiA 301.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import struct
 from collections import defaultdict
@@ -295,11 +294,9 @@ class MailboxSdo:
         finally:
             self._in_use = False
 
-    def synchronize(self) -> Steps[None]:
+    def fall_out_of_step(self) -> None:
         """To be called when another user of the mailbox has counted on."""
         self._in_step = None
-        with contextlib.suppress(SdoAbortError):
-            yield from self.read(*_PROBED)
 
     def _ask(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
         """The answer to a request, which is sent once the mailbox is in step.
