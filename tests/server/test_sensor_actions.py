@@ -307,21 +307,6 @@ def test_a_long_job_of_one_sensor_does_not_hold_up_those_of_another() -> None:
     assert bench.asking.reply(tare)["ok"]
 
 
-def test_a_client_that_leaves_leaves_nothing_behind(
-    streaming: Bench, caplog: pytest.LogCaptureFixture
-) -> None:
-    for action, keys in (("sdo_read", {"index": "0x1008"}), ("tare", {"samples": 20})):
-        other = streaming.connect()
-        other.send(action, **keys)
-        streaming.run(0.004)
-        other.close()
-    while not (changed := streaming.ask("configure", settings={"imu_active": 3}))["ok"]:
-        assert changed["error"]["code"] == "busy"
-    streaming.run(0.1)
-    assert len(streaming.hub.connections) == 2
-    assert "Traceback" not in caplog.text
-
-
 # -- what `describe` says of settings: cheap for one sensor, and never more than a message may have
 
 
