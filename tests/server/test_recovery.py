@@ -124,19 +124,6 @@ def test_another_sensor_is_refused_and_the_right_one_taken_back(model: str) -> N
     check_frames(simulation.frames)
 
 
-@pytest.mark.parametrize("milliseconds", more_if_long(range(1, 60, 20), range(60)))
-def test_power_cut_again_while_being_set_up(milliseconds: int) -> None:
-    simulation, client = streaming()
-    for n in range(4):
-        simulation.at(0.001 * n * (50 + milliseconds), "power cycle 0.05")
-    simulation.run(0.004 * (50 + milliseconds))
-    client.wait_event("sensor_back")
-    assert len(client.fresh(100)) == 100
-    assert state(client) == "OP"
-    assert simulation.stats()["al_state"] == "OP"
-    check_frames(simulation.frames)
-
-
 def test_an_interface_that_is_down_is_the_reason_and_is_asked_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
