@@ -12,8 +12,6 @@ import pytest
 from bota_ethercat.pdo import LAYOUTS, encode
 from bota_ethercat.text.json_text import JsonObject
 from ethercat_server.ethercat.slave.coe import Emergency
-from ethercat_server.simulation.backend import MemoryBackend
-from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.simulation import Simulation, check_frames, life_of, more_if_long
 
@@ -166,36 +164,6 @@ def test_no_answer_is_taken_from_a_job_and_no_emergency_is_lost_to_it() -> None:
         assert simulation.clock.now_ns - asked_ns < 400_000_000
     simulation.run_until(lambda: simulation.status()["sensors"][0]["emergencies"] == 50, "all of them")
     assert simulation.streams[0].lost_samples == 0
-
-
-@pytest.mark.parametrize("seed", more_if_long([0], range(3)))
-def test_a_start_survives_emergencies_and_keeps_the_last(log: pytest.LogCaptureFixture, seed: int) -> None:
-    backend = MemoryBackend(machine=Machine(seed=seed))
-
-    def report() -> None:
-        backend.command(HOT)
-
-    for n in range(400):  # from before the start until it is over; without a mailbox in INIT
-        backend.clock.at(backend.clock.now_ns + n * 7_000_000, report)
-    simulation = Simulation(backend=backend)
-    row = simulation.status()["sensors"][0]
-    assert row["emergencies"] > 0
-    assert row["emergency"]["code"] == 0x4210
-    assert len(said(log, "sensor 0 reports emergency 0x4210")) == 1
-    simulation.run(1.0)
-    assert simulation.streams[0].fresh > 0
-
-
-def test_a_lost_sensor_is_set_up_again_in_spite_of_emergencies() -> None:
-    simulation = Simulation()
-    simulation.run(1.0)
-    for n in range(300):  # without power there is no mailbox
-        simulation.at(n * 0.005, lambda: simulation.backend.command(HOT))
-    simulation.at(0.0, "power cycle 0.5")
-    simulation.run_until(
-        lambda: [e for e in simulation.events if e["event"] == "sensor_back"], "it back", 10.0
-    )
-    assert simulation.status()["sensors"][0]["emergencies"] > 0
 
 
 def test_messages_of_every_length_and_service_are_parsed_or_not() -> None:
