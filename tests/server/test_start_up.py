@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-import random
 import re
 import signal
 import socket
@@ -40,7 +39,6 @@ from ethercat_server.sensor import scan
 from ethercat_server.sensor.objects.dictionary import BY_SETTING
 from ethercat_server.sensor.scan import scan_if_free
 from ethercat_server.simulation.backend import MemoryBackend
-from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor import virtual_bus
 from ethercat_server.virtual_sensor.dictionary import Dictionary
 from ethercat_server.virtual_sensor.foreign import ForeignSlave
@@ -49,7 +47,6 @@ from tests.ended import completed, run_here
 from tests.rights import NET_ADMIN, NET_RAW, without
 from tests.server.running import (
     ATTEMPTS,
-    OLD,
     Program,
     Server,
     Veth,
@@ -68,7 +65,6 @@ from tests.simulation import (
     check_frames,
     life_of,
     more_if_long,
-    reading,
     registers,
 )
 from tests.tool import odd_firmware
@@ -630,10 +626,10 @@ READING_THE_SII: Final = range(reg.SII_OWNER, reg.SII_DATA)
 KINDS: Final = ("EK1100", "EL3102", "DRIVE", "DRIVE:PREOP")
 
 
-def mixed(text: str, machine: Machine | None = None) -> Simulation:
+def mixed(text: str) -> Simulation:
     """A server on this chain, its sensors with clocks of their own."""
     sensors = [SensorOptions(signal="clock", serial=1 + n, ppm=150.0 - 200 * n) for n in range(2)]
-    return Simulation(backend=MemoryBackend(*slaves_in(parse_chain(text), sensors), machine=machine))
+    return Simulation(backend=MemoryBackend(*slaves_in(parse_chain(text), sensors)))
 
 
 def every_chain() -> list[str]:
@@ -737,18 +733,6 @@ def test_a_sensor_among_others_comes_back(text: str, fault: str) -> None:
     assert all(sensor.streams for sensor in simulation.sensors)
     check_each(simulation)
     assert_left_alone(simulation, text)
-
-
-@pytest.mark.parametrize("seed", more_if_long(range(2), range(40)))
-def test_on_a_wire_that_loses_frames(seed: int) -> None:
-    text = random.Random(seed).choice(every_chain())
-    simulation = mixed(text, Machine(seed=seed, lost=0.01))
-    simulation.run(1.0)
-    for number in range(len(simulation.sensors)):
-        new = [f for f in simulation.frames if f.sensor == number and not f.flags & OLD]
-        assert len(new) > 700
-        assert all(reading(b).instant_ns > reading(a).instant_ns for a, b in itertools.pairwise(new))
-    assert all(map(only_the_sii_was_read, foreign(simulation)))
 
 
 def test_addresses_that_others_answer_to_are_not_taken() -> None:
