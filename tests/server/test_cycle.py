@@ -455,21 +455,6 @@ def test_register_reads_cost_a_slow_card_no_sample(milliseconds: float) -> None:
     assert lost(running.frames) == 0
 
 
-@pytest.mark.parametrize("seed", more_if_long([1], range(20)))
-@pytest.mark.parametrize("disturbance_ms", more_if_long([700], [20, 300, 700]))
-def test_the_clock_holds_over_a_stop_of_the_machine(disturbance_ms: float, seed: int) -> None:
-    machine = Machine(seed=seed, wake_ns=30_000, frame_jitter_ns=40_000)
-    running = run(machine, 32, seconds=0.5)
-    for _ in range(3):
-        running.clock.stall(disturbance_ms * 1e6)
-        running.run(0.02)
-        assert running.streams[0].clock.locked
-        running.frames.clear()
-        running.run(0.6)
-        check_frames(running.frames)
-        assert lost(running.frames) <= 0.01 * len(running.frames)
-
-
 @pytest.mark.parametrize("count", more_if_long([4], [4, 8, 16]))
 def test_many_sensors_with_clocks_of_their_own(count: int) -> None:
     chance = random.Random(count)
