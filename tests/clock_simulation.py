@@ -103,9 +103,7 @@ class Controller:
     late_ns: float = 0.0  # the event time is late; early if negative: that of the buffer's start
     jitter_ns: float = 0.0  # its random error (standard deviation)
     lags: int = 0  # number of samples by which it lags behind
-    counter: int = 1  # working counter of its registers
     lies_from_s: float = 0.0  # when all this begins, in s from the start
-    lies_until_s: float = math.inf  # when it ends, except for a step of the local time
 
     def local(self, at_ns: float) -> int:
         """The local time then."""
@@ -122,7 +120,7 @@ class Controller:
         """What a frame reads that is at the slave at `look_ns`, when the sample `number` is the newest."""
         change = 0
         if number >= 0:
-            if not self.lies_from_s * SECOND <= look_ns < self.lies_until_s * SECOND:
+            if look_ns < self.lies_from_s * SECOND:
                 change = self.local(instants_ns[number])
             else:
                 event_ns = instants_ns[max(0, number - self.lags)] + self.late_ns
@@ -130,7 +128,7 @@ class Controller:
                     event_ns += random.Random(number).gauss(0, self.jitter_ns)
                 change = 0 if self.stuck else self.local(event_ns)
         wrap = 1 << 32
-        return self.local(look_ns) % wrap, self.counter, change % wrap, self.counter
+        return self.local(look_ns) % wrap, 1, change % wrap, 1
 
 
 class Sample(NamedTuple):

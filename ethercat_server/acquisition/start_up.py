@@ -138,9 +138,14 @@ def _find_sensors(bus: Bus, wanted: Wanted, check_interrupt: CheckInterrupt) -> 
             "and that this is the interface it is connected to"
         )
     for number, slave in enumerate(of_sensors):
-        _check_mailboxes(bus.ifname, number, slave)
-
+        if not slave.has_coe or not any(_mailbox_sizes(slave)):
+            raise BusError(
+                f"sensor {number} on {bus.ifname} has no CoE mailbox, and so no objects to set it up by: its "
+                "EEPROM is damaged"
+            )
     terminals = find_terminals(others, wanted.terminals)
+    for slave in (*of_sensors, *(terminal.slave for terminal in terminals)):
+        _check_mailboxes(bus.ifname, slave)
     bus.input_sizes = {terminal.slave.position: terminal.size for terminal in terminals}
     others = [slave for slave in others if slave.position not in bus.input_sizes]
 
@@ -221,16 +226,14 @@ def _note_offset(sdo: Sdo, sensor: Sensor) -> Steps[None]:
         log.info("sensor %d has a tare in force (saved or not): %s", sensor.number, ", ".join(texts))
 
 
-def _check_mailboxes(ifname: str, number: int, slave: Slave) -> None:
-    """BusError for mailboxes that no master can use: pysoem would not notice."""
+def _mailbox_sizes(slave: Slave) -> list[int]:
     assert slave.sii is not None
-    sizes = [size for _, size in slave.sii["mailboxes"].values()]
-    if not slave.has_coe or not any(sizes):
-        raise BusError(
-            f"sensor {number} on {ifname} has no CoE mailbox, and so no objects to set it up by: its EEPROM "
-            "is damaged"
-        )
-    if not all(size in _MAILBOX_BYTES for size in sizes):
+    return [size for _, size in slave.sii["mailboxes"].values()]
+
+
+def _check_mailboxes(ifname: str, slave: Slave) -> None:
+    """BusError for mailboxes that no master can use: pysoem would not notice."""
+    if any(sizes := _mailbox_sizes(slave)) and not all(size in _MAILBOX_BYTES for size in sizes):
         raise BusError(
             f"the SII (EEPROM) of the slave at position {slave.position} of {ifname} has mailboxes of "
             f"{' and '.join(map(str, sizes))} bytes, which no frame can carry: its EEPROM is damaged"

@@ -106,7 +106,7 @@ class Bus(Datagrams):
         if self._soem is not None:
             self._soem.map_process_data(check_interrupt)
             for slave in self.slaves:
-                self.finish(slave.sdo.synchronize(), check_interrupt)
+                slave.sdo.fall_out_of_step()
         else:
             logical = self._free_logical()
             for slave, content in zip(self.slaves, self._sensors_sii(), strict=True):

@@ -111,42 +111,21 @@ class Trace:
             raise TraceError("it is damaged") from error
         self.about: dict[str, Any] = header
 
-    def replay(self, *, anew: bool = False) -> Iterator[Decision]:
-        """What the clocks make of each record of a sensor; TraceError where a record cannot be.
-
-        `anew`: not from the state of the snapshots, but from the beginning, as a server that starts there:
-        for a trace of another version of the clocks.
-        """
+    def replay(self) -> Iterator[Decision]:
+        """What the clocks make of each record of a sensor; TraceError where a record cannot be."""
         try:
-            yield from self._replay(anew)
+            yield from self._replay()
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             raise TraceError("its snapshots are damaged, or of another version") from error
 
-    def _begin_anew(self, state: Any, before: Clocks | None) -> Clocks:
-        """Clocks that know nothing; of those `before` the ones that did not begin anew here."""
-        round_trip = before.round_trip if before else RoundTrip(state["round_trip"]["_wire_ns"])
-        clocks = list(before.sensors) if before else []
-        for number, each in enumerate(state["sensors"]):
-            if number < len(clocks) and each["_begun"]:
-                continue
-            events, offset_ns = each["events"], each["_data_offset_ns"]
-            if events is not None:
-                loop_ns = round(2 * events["_half_loop_ns"])
-                slave = DistributedClock(events["_offset"], loop_ns, events["_reading_ns"])
-                events = EventTimes(slave, round_trip, offset_ns)
-            period_ns = 1e9 / self.about["sensors"][number]["nominal_hz"]
-            clocks[number : number + 1] = [SampleClock(period_ns, round_trip, events, offset_ns)]
-        return Clocks(round_trip, clocks)
-
-    def _replay(self, anew: bool) -> Iterator[Decision]:
+    def _replay(self) -> Iterator[Decision]:
         waiting = list(self._snapshots)
         clocks: Clocks | None = None
         pending: list[SampleClock] = []
         pending_ns = 0
         for number, record in enumerate(self.records):
             while waiting and waiting[0][0] <= number:
-                state = waiting.pop(0)[1]
-                clocks = self._begin_anew(state, clocks) if anew else clocks_of(state)
+                clocks = clocks_of(waiting.pop(0)[1])
             if clocks is None:
                 continue
             sent_ns, back_ns = record.sent_ns, record.sent_ns + record.duration_ns

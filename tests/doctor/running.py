@@ -12,7 +12,7 @@ from ethercat_server.doctor.bus_checks import examine_bus
 from ethercat_server.doctor.cli import main
 from ethercat_server.doctor.report import NAMES, CheckResult, worst
 from tests import rights
-from tests.doctor.made_up import FACTS, Facts, Files, machine
+from tests.doctor.made_up import machine
 from tests.ended import Result, patiently, run, run_here
 from tests.rights import NOBODY
 from tests.simulation import SimulatedBus
@@ -67,13 +67,10 @@ def examined(
     bus: SimulatedBus,
     root: Path,
     seconds: float = 0.2,
-    *,
-    files: Files | None = None,
-    facts: Facts = FACTS,
     announce: Callable[[str], None] = lambda _: None,
 ) -> BusFindings:
-    """The doctor's examination of `bus` on a machine that is good but for `files` and `facts`."""
-    subject = machine(root, files, facts)
+    """The doctor's examination of `bus` on a good machine."""
+    subject = machine(root)
     subject.ifname = bus.near
     found = BusFindings(examine_bus(subject, seconds, announce))
     assert not [finding for finding in found if "error in ethercat-doctor" in finding.found]

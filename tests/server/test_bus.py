@@ -166,14 +166,10 @@ def test_indices_are_none_of_soems() -> None:
     assert {frame[17] for frame in wire.sent} == set(range(0x80, 0x90))
 
 
-def operational(
-    *sensors: SensorOptions, machine: Machine | None = None, lrw: bool = True
-) -> tuple[Bus, MemoryBackend]:
-    backend = MemoryBackend(*sensors, machine=machine)
-    if not lrw:
-        take_lrw_away(life_of(backend, -1))
-    bus = Bus(backend)
+def operational() -> tuple[Bus, MemoryBackend]:
+    bus = Bus(backend := MemoryBackend())
     bring_up(bus, asked(), lambda: None)
+    backend.become(Machine(frame_jitter_ns=0))
     return bus, backend
 
 
@@ -195,7 +191,6 @@ def awaited(exchange: Taken | None) -> Taken:
 def test_an_answer_that_comes_again_is_a_duplicate_until_its_index_is_in_use_again() -> None:
     bus, backend = operational()
     process_data = bus.process_data
-    backend.become(Machine(frame_jitter_ns=0))
     answer = answers(bus, backend)
     assert awaited(process_data.match(answer, 1))
     assert process_data.match(answer, 1) is process_data.match(answer, 1) is DUPLICATE
@@ -210,7 +205,6 @@ def test_an_answer_that_comes_again_is_a_duplicate_until_its_index_is_in_use_aga
 def test_an_answer_whose_index_is_in_use_again_is_not_taken_for_the_later_one() -> None:
     bus, backend = operational()
     process_data = bus.process_data
-    backend.become(Machine(frame_jitter_ns=0))
     late = answers(bus, backend)
     backend.clock.sleep(0.2)
     assert process_data.lost == 1
@@ -226,7 +220,6 @@ def test_an_answer_whose_index_is_in_use_again_is_not_taken_for_the_later_one() 
 def test_exchanges_are_counted_when_they_are_sent_and_when_they_are_answered() -> None:
     bus, backend = operational()
     process_data = bus.process_data
-    backend.become(Machine(frame_jitter_ns=0))
     sent, answered = process_data.sent, process_data.answered
     answers(bus, backend)  # which is not taken: its index stays in use for 100 ms
     for _ in range(INDICES + 5):

@@ -432,35 +432,3 @@ def test_their_reading_does_not_keep_root_from_its_work() -> None:
         found.check()
         assert answered[True] > 50
         assert answered[False] > 50, "only some may wait for a sensor"
-
-
-REFUSED = {
-    "a length that is too great": b"\xff" * 5,
-    "a line without end": b"{" * (MAX_REQUEST_LENGTH + 1),
-    "no JSON": framed(b"[" * (MAX_REQUEST_LENGTH - 10)),
-    "no JSON on a line": b"{" + b"x" * (MAX_REQUEST_LENGTH - 10) + b"\n",
-    "no such action": encode_json(request("x" * (MAX_REQUEST_LENGTH - 100))),
-    "a type that does not fit": encode_json(request("sdo_read", index=0x1008, type="f32")),
-}
-
-
-@pytest.mark.parametrize("sent", more_if_long(["a line without end", "no such action"], REFUSED))
-def test_what_was_refused_leaves_nothing_behind(sent: str) -> None:
-    """The server collects no circles while the bus runs, and an exception that is kept easily makes one."""
-    with besieged() as found:
-
-        def refuse(count: int) -> int:
-            streams = [found.connect(0) for _ in range(count)]
-            for stream in streams:
-                stream.send(REFUSED[sent])
-                stream.end_sending()
-            found.simulation.run_until(lambda: all(stream.other.closed for stream in streams), "the end")
-            assert all(b'"ok":false' in stream.recv_all() for stream in streams)
-            found.check_status()
-            found.forget_streams()
-            return sys.getallocatedblocks()
-
-        for _ in range(12):  # until what is kept of each sample is as much as it comes to
-            before = refuse(50)
-        assert refuse(50) - before < 500, "a circle is of more than ten blocks"
-        assert gc.collect() == 0

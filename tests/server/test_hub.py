@@ -677,6 +677,7 @@ def test_others_may_read_and_not_control() -> None:
         ("tare", {}),
         ("sdo_write", {"index": 0x8000, "subindex": 1, "hex": "00000000"}),
         ("sii_read", {"word": 0}),
+        ("trace", {}),
         ("shutdown", {}),
     ):
         assert client.refused(action, **keys)["code"] == "denied", action

@@ -171,14 +171,13 @@ def test_the_server_streams_and_ends_while_nobody_reads_its_log(pipe: Pipe) -> N
         with contextlib.closing(Server("virtual", under=into_pipe)) as running:
             while running.process.poll() is None:
                 try:
-                    client = running.connect()
+                    with running.connect() as client:
+                        assert client.ask("subscribe")["ok"]
+                        client.fresh(100)
+                        assert client.ask("shutdown")["ok"]
                 except ConnectionFailedError:
                     time.sleep(0.02)
                     continue
-                with client:
-                    assert client.ask("subscribe")["ok"]
-                    client.fresh(100)
-                    assert client.ask("shutdown")["ok"]
                 assert running.wait() == 0
                 return
     pytest.fail("it did not start")

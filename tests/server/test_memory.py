@@ -65,7 +65,9 @@ def any_request(chance: random.Random, action: str) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("seed", more_if_long(range(2), range(40)))
-def test_requests_refusals_losses_and_recoveries_leave_nothing_to_collect(seed: int) -> None:
+def test_requests_refusals_losses_and_recoveries_leave_nothing_to_collect(
+    seed: int, caplog: pytest.LogCaptureFixture
+) -> None:
     chance = random.Random(seed)
     simulation = Simulation(SensorOptions(signal="rest"), SensorOptions(signal="rest"))
     clients = [simulation.connect(0 if number % 3 else 4711) for number in range(CLIENTS)]
@@ -94,6 +96,8 @@ def test_requests_refusals_losses_and_recoveries_leave_nothing_to_collect(seed: 
     codes = {reply.get("error", {}).get("code", "ok") for reply in replies}
     # Whether a request meets one under way goes by the seed.
     assert codes >= {"ok", "bad_request", "denied"} | ({"busy"} if seed < 3 else set())
+    assert len(simulation.hub.connections) == len(clients)
+    assert "Traceback" not in caplog.text
     assert gc.collect() == 0
 
 

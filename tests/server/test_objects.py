@@ -395,7 +395,7 @@ IMU = BY_SETTING["imu_active"].address
 
 
 class NoBus:
-    """Whatever is done on it has no time to be in time for; each look at the exchanges finds one more."""
+    """Each look at the exchanges finds one more."""
 
     clock = SYSTEM_CLOCK
 
@@ -405,10 +405,6 @@ class NoBus:
     @property
     def answered(self) -> int:
         return next(self._answered)
-
-    @contextlib.contextmanager
-    def in_time(self, _until_ns: int) -> Iterator[None]:
-        yield
 
 
 class ScriptedSdo:
@@ -520,9 +516,10 @@ def noise(seed: int, deviation: float) -> Iterator[float]:
 
 
 def test_fewer_samples_than_show_rest_are_not_taken() -> None:
-    force = iter(range(1000))
-    with pytest.raises(RequestError, match="Fx varies by"):
-        run_tare(ScriptedSdo(), 1, [0.0] * 6, (float(n) for n in force))
+    sdo, force = ScriptedSdo(), iter(range(1000))
+    with pytest.raises(RequestError, match="sensor 0 is not at rest: Fx varies by") as refused:
+        run_tare(sdo, 1, [0.0] * 6, (float(n) for n in force))
+    assert (refused.value.code, sdo.written) == (ErrorCode.NOT_READY, [])
     assert next(force) >= 20
 
 
@@ -615,51 +612,33 @@ def test_emergencies_are_told_at_a_bounded_rate_and_all_are_counted(caplog: pyte
             known.note(number, Emergency(code, 0x81, b"\1\2"))
         return told
 
-    assert note(0x4210, 0x4210, 0x12) == [(1, 0x4210, 1), (1, 0x12, 3)]
-    assert [record.levelname for record in caplog.records] == ["WARNING", "WARNING", "INFO"]
-    assert caplog.messages[-2] == (
+    assert note(0x4210, 0x4210, 0x12, 0x4210) == [(1, 0x4210, 1), (1, 0x12, 3), (1, 0x4210, 4)]
+    assert [record.levelname for record in caplog.records] == ["WARNING", "WARNING", "INFO", "WARNING"]
+    assert caplog.messages[-1] == (
         "sensor 1 reports emergency 0x4210 (temperature), error register 0x81, data 0102"
     )
-    assert [code for _, code, _ in note(*range(0x5001, 0x5007))] == [0x5001, 0x5002, 0x5003]
+    assert [code for _, code, _ in note(*range(0x5001, 0x5007))] == [0x5001, 0x5002]
     assert note(0x4210, number=2) == [(2, 0x4210, 1)]
     clock.sleep(0.999)
     assert note(0x5010) == []
     clock.sleep(0.001)
-    assert note(0x5011, 0x5012) == [(1, 0x5011, 11)]
+    assert note(0x5011, 0x5012) == [(1, 0x5011, 12)]
     clock.sleep(9.999)
     assert note(0x5011) == []
     clock.sleep(0.001)
-    assert note(0x5011) == [(1, 0x5011, 14)]
+    assert note(0x5011) == [(1, 0x5011, 15)]
     clock.sleep(100.0)
     assert len(note(*range(0x6000, 0x6009))) == 5
-    texts = [Emergency(code, 0, b"").text for code in (0x00FF, 0x5123, 0x8FFF, 0x81FF, 0xB001)]
-    hardware, none = "hardware of the device", "of no class that CiA 301 defines"
-    assert texts == ["error reset, or no error", hardware, "monitoring", "communication", none]
+    texts = {
+        0x00FF: "error reset, or no error", 0x5123: "hardware of the device", 0x8FFF: "monitoring",
+        0x81FF: "communication", 0xFF07: "device-specific", 0xB001: "of no class that CiA 301 defines",
+    }  # fmt: skip
+    assert {code: Emergency(code, 0, b"").text for code in texts} == texts
+    assert [code for code in texts if Emergency(code, 0, b"").is_reset] == [0x00FF]
     clock.sleep(1.2344)
     last = {"code": 0x6008, "text": "software of the device", "register": 0x81, "data": "0102"}
-    assert known.status(1) == {"emergencies": 23, "emergency": {**last, "ago_s": 1.234}}
-    assert note(0x6008) == [(1, 0x6008, 24)]
+    assert known.status(1) == {"emergencies": 24, "emergency": {**last, "ago_s": 1.234}}
+    assert note(0x6008) == [(1, 0x6008, 25)]
     clock.sleep(0.5)
     assert note(0x6008) == []
-    assert known.status(1) == {"emergencies": 25, "emergency": {**last, "ago_s": 0.0}}
-
-
-@pytest.mark.parametrize(
-    ("areas", "is_refused"),
-    [
-        (((0x1000, 128), (0x1080, 128)), False),
-        (((0x1000, 0), (0x1080, 0)), False),
-        (((0x1000, 16), (0x1080, 1486)), False),
-        (((0x1000, 15), (0x1080, 128)), True),
-        (((0x1000, 128), (0x1080, 1487)), True),
-    ],
-)
-def test_mailboxes_that_no_frame_can_carry(areas: Any, is_refused: bool) -> None:
-    with contextlib.nullcontext() if not is_refused else pytest.raises(BusError) as error:
-        MailboxSdo(cast(Bus, GivenBus()), 3, areas)
-    if is_refused:
-        assert error is not None
-        assert str(error.value) == (
-            f"sensor 3 has mailboxes of {areas[0][1]} and {areas[1][1]} bytes, which no frame can carry: "
-            "power it off and on"
-        )
+    assert known.status(1) == {"emergencies": 26, "emergency": {**last, "ago_s": 0.0}}

@@ -29,10 +29,9 @@ def simulate(
     return ClockSimulation(sensor, card, machine, seed).run(seconds).outcome(SETTLED_S)
 
 
-def slow(round_trip_ms: float, jitter_ms: float = 0.0, lost: float = 0.0) -> Card:
+def slow(round_trip_ms: float, jitter_ms: float = 0.0) -> Card:
     """A network card on USB."""
-    least_ns = (round_trip_ms - jitter_ms) * 1e6
-    return Card(least_ns, spread=0, jitter_ns=2 * jitter_ms * 1e6, lost=lost)
+    return Card((round_trip_ms - jitter_ms) * 1e6, spread=0, jitter_ns=2 * jitter_ms * 1e6)
 
 
 @pytest.mark.parametrize("ppm", more_if_long([500, -500], [0, 150, -300, 500, -500]))

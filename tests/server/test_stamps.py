@@ -91,30 +91,9 @@ def test_registers_that_stop_in_operation_cost_no_sample(caplog: pytest.LogCaptu
     assert (status["lost_samples"], status["invalid"], status["recoveries"]) == (0, 0, 0)
 
 
-def test_a_sensor_that_lost_its_power_is_dated_by_its_new_clock() -> None:
-    running = settled("at=3000000000")
-    running.command("power cycle 0.3")
-    running.run(SETTLED_S + 2)
-    assert running.status()["sensors"][0]["recoveries"] == 1
-    assert stamps(running) == "hardware"
-    errors = errors_ns(running.frames)[-400:]
-    assert max(errors) - min(errors) < 10_000
-
-
 def test_each_sensor_of_a_bus_has_its_own_clock() -> None:
     running = settled("ppm=40", "none", "ppm=-40+at=4000000000")
     assert [stamps(running, number) for number in range(3)] == ["hardware", "polling", "hardware"]
-
-
-def test_what_another_master_has_written_to_the_clock_is_taken_into_account() -> None:
-    before = simulation("")
-    before.run(0.1)
-    before.close()
-    assert life_of(before.backend).esc.write(reg.DC_OFFSET, struct.pack("<QI", 10**18 + 2**31, 350))
-    running = Simulation(backend=before.backend)
-    running.run(SETTLED_S)
-    assert stamps(running) == "hardware"
-    assert max(map(abs, errors_ns(running.frames)[-400:])) < 10_000
 
 
 @pytest.mark.parametrize("seed", more_if_long([1, 2], range(1, 7)))

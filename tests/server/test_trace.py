@@ -217,6 +217,34 @@ def test_what_a_held_up_exchange_cost_is_not_blamed_on_the_sensor() -> None:
     assert "sensor" not in {loss.cause for loss in found}
 
 
+def step(
+    sent_ns: int,
+    lost: int = 0,
+    uncertain: bool = False,
+    kind: RecordKind = RecordKind.FRESH,
+    sensor: int = 0,
+    took_ns: int = 100_000,
+) -> Decision:
+    """A hand-made one: a sample so many after the one before, that was dated by its event."""
+    return Decision(
+        Record(sent_ns, took_ns, 0, 0, sensor, kind, False, 3), sent_ns, lost + 1, uncertain, True, True
+    )
+
+
+def found(steps: Sequence[Decision]) -> list[tuple[str, str]]:
+    """Cause and text of each loss in them."""
+    return [loss[2:] for loss in find_losses(0, steps)]
+
+
+def shown(steps: Sequence[Decision]) -> list[str]:
+    """What the doctor shows of a trace with these decisions."""
+    about = {"program": "x 1", "sensors": [{"model": "M8"}]}
+    made = SimpleNamespace(about=about, records=steps, replay=lambda: iter(steps))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ethercat_server.doctor.trace.Trace", lambda _: made)
+        return [*show(Path("/dev/null"))]
+
+
 @pytest.mark.parametrize(
     ("asleep_ms", "took_ms", "expected"),
     [
@@ -240,20 +268,15 @@ def test_the_cause_of_a_loss_is_what_took_the_time(
         lost, long_one = number == 20, number in (19, 20)
         sent_ns += round((asleep_ms if lost else 0.9) * 1e6)
         took_ns = round((took_ms if long_one else 0.1) * 1e6)
-        record = Record(sent_ns, took_ns, 0, 0, 0, RecordKind.FRESH, False, 3)
-        steps.append(Decision(record, sent_ns, 3 if lost else 1, False, True, False))
+        steps.append(step(sent_ns, 2 * lost, took_ns=took_ns))
         sent_ns += took_ns
-    assert [loss[2:] for loss in find_losses(0, steps)] == [expected]
+    assert found(steps) == [expected]
 
 
 def test_a_sensor_that_takes_no_part_is_told_once() -> None:
     kinds = [RecordKind.FRESH] * 5 + [RecordKind.INVALID] * 4 + [RecordKind.FRESH] * 5
-    steps = [
-        Decision(Record(at, 10**5, 0, 0, 0, kind, False, 3), at, 5 if number == 9 else 1, False, True, False)
-        for number, kind in enumerate(kinds)
-        for at in [10**9 + number * 10**6]
-    ]
-    assert [loss[2:] for loss in find_losses(0, steps)] == [
+    steps = [step(10**9 + number * 10**6, 4 * (number == 9), kind=kind) for number, kind in enumerate(kinds)]
+    assert found(steps) == [
         ("not in the exchange", "it took no part in an exchange (working counter 3)"),
         ("not in the exchange", "4 lost: while it took no part"),
     ]
@@ -262,36 +285,30 @@ def test_a_sensor_that_takes_no_part_is_told_once() -> None:
 def test_what_was_uncertain_is_told_where_it_is_counted() -> None:
     """Once, with the reason of the sample at which it came up; the first has nothing before it."""
 
-    def found(*told: tuple[int, bool]) -> list[tuple[str, str]]:
+    def of(*told: tuple[int, bool]) -> list[tuple[str, str]]:
         steps = list[Decision]()
         for number in range(20):
             count, uncertain = dict(enumerate(told, 8)).get(number, (1, number == 0))
             took_ns = 2_000_000 if number == 8 and uncertain else 100_000
-            record = Record(10**9 + number * 10**6, took_ns, 0, 0, 0, RecordKind.FRESH, False, 3)
-            steps.append(Decision(record, record.sent_ns, count, uncertain, True, False))
-        return [loss[2:] for loss in find_losses(0, steps)]
+            steps.append(step(10**9 + number * 10**6, count - 1, uncertain, took_ns=took_ns))
+        return found(steps)
 
     held = "an exchange took 2.00 ms"
-    assert found((1, True)) == [("uncertain", f"maybe one lost: {held}")]
-    assert found((1, True), (2, False)) == [
+    assert of((1, True)) == [("uncertain", f"maybe one lost: {held}")]
+    assert of((1, True), (2, False)) == [
         ("uncertain", f"maybe one lost: {held}"),
         ("card or slave", f"1 lost: {held}"),
     ]
-    assert found((1, True), (1, True), (1, False)) == [("uncertain", f"maybe one lost: {held}")]
-    assert found((0, False)) == [("uncertain", "a sample that was counted as lost came late")]
+    assert of((1, True), (1, True), (1, False)) == [("uncertain", f"maybe one lost: {held}")]
+    assert of((0, False)) == [("uncertain", "a sample that was counted as lost came late")]
 
 
 def test_of_what_was_before_the_first_record_nothing_is_known() -> None:
-    steps = [
-        Decision(Record(at, 10**5, 0, 0, 0, RecordKind.FRESH, False, 3), at, count, count == 1, True, False)
-        for at, count in ((10**9, 1), (10**9 + 10**6, 2))
-    ]
-    assert [loss[2:] for loss in find_losses(0, steps)] == [
-        ("uncertain", "1 lost: what came before is not in the trace")
-    ]
+    steps = [step(10**9, uncertain=True), step(10**9 + 10**6, 1)]
+    assert found(steps) == [("uncertain", "1 lost: what came before is not in the trace")]
 
 
-def test_a_trace_is_shown_line_by_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trace_is_shown_line_by_line() -> None:
     """With a pause of 20 s in it."""
     steps = list[Decision]()
     for number in range(1200):
@@ -301,11 +318,7 @@ def test_a_trace_is_shown_line_by_line(tmp_path: Path, monkeypatch: pytest.Monke
         at = 10**9 + number * 10**7 + 20_000_000_000 * (number >= 600)
         record = Record(at, 100_000 + 100 * (number % 100), 0, 0, 0, kind, number % 2 > 0, 3)
         steps.append(Decision(record, at - 50_000, lost, number == 0, number < 900, number % 2 > 0))
-    made = SimpleNamespace(about={"program": "x 1", "sensors": [{"model": "M8"}]}, records=[*steps])
-    made.replay = lambda: iter(steps)
-    monkeypatch.setattr("ethercat_server.doctor.trace.Trace", lambda _: made)
-    (path := tmp_path / "a.trace").write_bytes(b"")
-    lines = [*show(path)]
+    lines = shown(steps)
     assert lines[:14] == [
         "written by x 1, 1200 records",
         "\nsensor 0 (M8)",
@@ -326,35 +339,18 @@ def test_a_trace_is_shown_line_by_line(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize(("losses", "last"), [(20, "20 lost: it was"), (21, "(1 more)")])
-def test_of_many_losses_the_first_are_shown(
-    losses: int, last: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    steps = [
-        Decision(Record(at, 10**5, 0, 0, 0, RecordKind.FRESH, False, 3), at, number, False, True, True)
-        for number in range(1, losses + 2)
-        for at in [10**9 + number * 10**7]
-    ]
-    made = SimpleNamespace(about={}, records=steps, replay=lambda: iter(steps))
-    monkeypatch.setattr("ethercat_server.doctor.trace.Trace", lambda _: made)
-    (path := tmp_path / "a.trace").write_bytes(b"")
-    assert last in [*show(path)][-1]
+def test_of_many_losses_the_first_are_shown(losses: int, last: str) -> None:
+    assert last in shown([step(10**9 + lost * 10**7, lost) for lost in range(losses + 1)])[-1]
 
 
-def test_sensors_are_shown_one_by_one_and_their_losses_in_order(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sensors_are_shown_one_by_one_and_their_losses_in_order() -> None:
     """The header does not describe the second one."""
     steps = [
-        Decision(Record(at, 10**5, 0, 0, sensor, RecordKind.FRESH, False, 3), at, steps, False, True, True)
+        step(10**9 + number * 10**7 + sensor, number == lost, sensor=sensor)
         for number in range(40)
         for sensor, lost in ((0, 30), (2, 20))
-        for at, steps in [(10**9 + number * 10**7 + sensor, 1 + (number == lost))]
     ]
-    made = SimpleNamespace(about={"program": "x 1", "sensors": [{"model": "M8"}]}, records=[*steps])
-    made.replay = lambda: iter(steps)
-    monkeypatch.setattr("ethercat_server.doctor.trace.Trace", lambda _: made)
-    (path := tmp_path / "a.trace").write_bytes(b"")
-    lines = [*show(path)]
+    lines = shown(steps)
     table = [
         "  0.4 s: 40 samples, 1 lost, 0 polls without a new sample, 0 invalid exchanges",
         "  age when it was here p50 100, p99 100, max 100 µs",
@@ -409,12 +405,6 @@ def test_a_trace_comes_in_parts_and_is_whole_or_none(tmp_path: Path, monkeypatch
     for sensors, model in (("M8", "None"), (["M8"], "None"), ([{"model": "M" * 41}], "M" * 37 + "...")):
         path.write_bytes(json.dumps({**json.loads(head), "sensors": sensors}).encode() + b"\n" + rest)
         assert [*show(path)][1] == f"\nsensor 0 ({model})"
-
-
-def test_who_may_not_control_the_server_gets_no_trace() -> None:
-    simulation = Simulation()
-    simulation.run(0.2)
-    assert simulation.connect(1234).refused("trace")["code"] == "denied"
 
 
 def test_a_loss_that_nothing_explains_leaves_a_trace_and_few_of_them(

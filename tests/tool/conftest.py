@@ -1,10 +1,35 @@
-"""The tool keeps its last tares in the user's home: not in that of who runs the tests."""
+"""Simulated buses; and a home of the tests, for the tool keeps its last tares in the user's."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from tests.simulation import SINC_LENGTH, SimulatedBus, simulated_bus
+
+TWO = ("--pdo", "77", "--serial", "10,20", "--sinc", SINC_LENGTH, "--noise", "none")
+
+
+@pytest.fixture
+def single() -> Iterator[SimulatedBus]:
+    with simulated_bus("--noise", "none") as bus:
+        yield bus
+
+
+@pytest.fixture
+def chain() -> Iterator[SimulatedBus]:
+    """Two sensors of the same model, with 77 bytes of process data."""
+    with simulated_bus("--sensors", "2", *TWO) as bus:
+        yield bus
+
+
+@pytest.fixture
+def models() -> Iterator[SimulatedBus]:
+    """Two of different models."""
+    with simulated_bus("--model", "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8", *TWO) as bus:
+        yield bus
 
 
 @pytest.fixture(autouse=True)

@@ -24,14 +24,9 @@ def tool_here(*arguments: object, code: int | None = 0) -> Result:
     return result
 
 
-def complaints(err: str) -> list[str]:
-    """What was said on standard error, but for what a machine without real-time scheduling adds."""
-    return [line for line in err.splitlines() if "not granted" not in line]
-
-
 def one_sentence(result: Result) -> str:
-    """The error of a failed run, which is one line on standard error."""
-    lines = complaints(result.err)
+    """The error of a failed run: one line, but for what a machine without real-time scheduling adds."""
+    lines = [line for line in result.err.splitlines() if "not granted" not in line]
     assert len(lines) == 1, result
     assert lines[0].startswith("ethercat-sensor: ")
     return lines[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
 
 import pytest
 
@@ -16,15 +15,8 @@ from ethercat_server.ethercat.nic import Routes
 from ethercat_server.simulation.backend import MemoryBackend
 from ethercat_server.tool import bus as find
 from tests.json_schema import problems
-from tests.simulation import SimulatedBus, chain, registers, simulated_bus, simulated_server
+from tests.simulation import SimulatedBus, chain, registers, simulated_server
 from tests.tool.running import told, tool_here
-
-
-@pytest.fixture
-def bench() -> Iterator[SimulatedBus]:
-    """Two sensors behind whatever is opened."""
-    with simulated_bus("--model", "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8", "--serial", "10,20") as bus:
-        yield bus
 
 
 def found(patch: pytest.MonkeyPatch, *adapters: Adapter, code: int = 0) -> dict[str, dict[str, object]]:
@@ -37,16 +29,16 @@ def found(patch: pytest.MonkeyPatch, *adapters: Adapter, code: int = 0) -> dict[
 
 
 def test_the_interface_with_the_sensors_is_found(
-    bench: SimulatedBus, monkeypatch: pytest.MonkeyPatch
+    models: SimulatedBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before = registers(bench.backend)
+    before = registers(models.backend)
     row = found(monkeypatch, Adapter("lo", loopback=True), Adapter("ens5"))["ens5"]
     assert row["sensors"] == [
         {"sensor": 0, "position": 0, "name": "BFT-SENS-ECAT-M8", "serial": 10},
         {"sensor": 1, "position": 1, "name": "BFT-ROKS-ECAT-M8", "serial": 20},
     ]
-    assert [bench.stats(n)["al_state"] for n in (0, 1)] == ["INIT", "INIT"]
-    assert [data[0x10:0x140] for data in registers(bench.backend)] == [data[0x10:0x140] for data in before]
+    assert [models.stats(n)["al_state"] for n in (0, 1)] == ["INIT", "INIT"]
+    assert [data[0x10:0x140] for data in registers(models.backend)] == [data[0x10:0x140] for data in before]
     shown = tool_here("find").out
     assert "ens5       BFT-SENS-ECAT-M8, serial 10; BFT-ROKS-ECAT-M8, serial 20" in shown
     assert "lo         left alone: loopback" in shown
@@ -80,11 +72,11 @@ def test_what_is_no_candidate_is_not_even_opened(
 
 
 def test_other_interfaces_without_a_sensor_are_told_apart(
-    bench: SimulatedBus, monkeypatch: pytest.MonkeyPatch
+    models: SimulatedBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     empty, foreign, at_work = MemoryBackend(), chain("EK1100"), chain("BOTA,DRIVE:OP")
     empty.command("power off")
-    buses = {"empty": empty, "foreign": foreign, "at_work": at_work, "ens5": bench.backend}
+    buses = {"empty": empty, "foreign": foreign, "at_work": at_work, "ens5": models.backend}
 
     def open_bus(ifname: str, **_: object) -> contextlib.closing[Bus]:
         if ifname == "denied":
@@ -92,7 +84,7 @@ def test_other_interfaces_without_a_sensor_are_told_apart(
         return contextlib.closing(Bus(buses[ifname]))
 
     before = registers(at_work)
-    with monkeypatch.context() as patch:  # undone before that of the bench
+    with monkeypatch.context() as patch:  # undone before that of the fixture
         patch.setattr(private_server, "open_bus", open_bus)
         rows = found(monkeypatch, *(Adapter(name) for name in (*buses, "denied")))
     assert rows["empty"]["found"] == "no EtherCAT slave answers"
@@ -103,8 +95,8 @@ def test_other_interfaces_without_a_sensor_are_told_apart(
     assert [name for name, row in rows.items() if row["sensors"]] == ["ens5"]
 
 
-def test_a_server_is_asked_for_its_sensors(bench: SimulatedBus, monkeypatch: pytest.MonkeyPatch) -> None:
-    with simulated_server(bench):
+def test_a_server_is_asked_for_its_sensors(models: SimulatedBus, monkeypatch: pytest.MonkeyPatch) -> None:
+    with simulated_server(models):
         holder = Holder(12, "ethercat-server", Address("127.0.0.1", 12001))
         row = found(monkeypatch, Adapter("ens5", holder=holder))["ens5"]
     assert "serial 10" in str(row["found"])

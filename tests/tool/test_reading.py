@@ -23,14 +23,6 @@ def bench() -> Iterator[SimulatedBus]:
         yield bus
 
 
-@pytest.fixture
-def chain() -> Iterator[SimulatedBus]:
-    """Two with 77 bytes."""
-    models = "BFT-SENS-ECAT-M8,BFT-ROKS-ECAT-M8"
-    with simulated_bus("--pdo", "77", "--model", models, "--serial", "10,20", "--sinc", "512") as bus:
-        yield bus
-
-
 @pytest.mark.parametrize(
     ("arguments", "head"),
     [
@@ -115,14 +107,14 @@ def test_an_eeprom_that_cannot_be_read_says_so(bench: SimulatedBus) -> None:
     assert told("eeprom", bench.near)["slaves"][0]["check_byte_right"]
 
 
-def test_objects_of_a_chain_by_place_serial_and_name(chain: SimulatedBus) -> None:
-    sensors = told("objects", chain.near)["sensors"]
+def test_objects_of_a_chain_by_place_serial_and_name(models: SimulatedBus) -> None:
+    sensors = told("objects", models.near)["sensors"]
     assert len(sensors) == 2
     assert not [row for row in sensors[1]["objects"] if row["index"] == "0x6000" and "error" in row]
     for which in ("1", "20", "serial:20", "BFT-ROKS-ECAT-M8"):
-        read = tool_here("read", chain.near, "Sampling rate", "--sensor", which, "--json")
+        read = tool_here("read", models.near, "Sampling rate", "--sensor", which, "--json")
         assert [row["serial"] for row in read.json["sensors"]] == [20]
-    assert "no sensor matches" in refused("objects", chain.near, "--sensor", "7", code=2)
+    assert "no sensor matches" in refused("objects", models.near, "--sensor", "7", code=2)
 
 
 def test_a_bus_that_is_silent_is_one_sentence(bench: SimulatedBus) -> None:
@@ -170,12 +162,6 @@ SERVER = ("--server", SimulatedServer.address)
 FORCE_Z = "0x6000:6"
 
 
-@pytest.fixture
-def bus() -> Iterator[SimulatedBus]:
-    with simulated_bus("--signal", "rest", "--noise", "none") as found:
-        yield found
-
-
 def unsettled_at_first(bus: SimulatedBus) -> None:
     """The sensor gives a wrong force for the first 0.4 s in OP, from now on."""
     state = ""
@@ -192,9 +178,9 @@ def unsettled_at_first(bus: SimulatedBus) -> None:
 
 
 @pytest.mark.parametrize("command", ["tare", "read"])
-def test_through_a_server_that_has_just_started(bus: SimulatedBus, command: str) -> None:
-    unsettled_at_first(bus)
-    with simulated_server(bus):
+def test_through_a_server_that_has_just_started(single: SimulatedBus, command: str) -> None:
+    unsettled_at_first(single)
+    with simulated_server(single):
         if command == "tare":
             shown = -told("tare", *SERVER, "--samples", 20)["new_offset"][2]
         else:

@@ -7,13 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.simulation import (
-    SINC_LENGTH,
-    SimulatedBus,
-    SimulatedServer,
-    simulated_bus,
-    simulated_server,
-)
+from tests.simulation import SimulatedBus, SimulatedServer, simulated_server
 from tests.tool.running import refused, told, tool_here
 
 Bench = tuple[SimulatedBus, SimulatedServer]
@@ -21,22 +15,9 @@ SERVER = ("--server", SimulatedServer.address)
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
-    options = [
-        "--sensors",
-        "2",
-        "--serial",
-        "10,20",
-        "--pdo",
-        "77",
-        "--signal",
-        "rest",
-        "--noise",
-        "none",
-        "--sinc",
-    ]
-    with simulated_bus(*options, SINC_LENGTH) as bus, simulated_server(bus) as server:
-        yield bus, server
+def bench(chain: SimulatedBus) -> Iterator[Bench]:
+    with simulated_server(chain) as server:
+        yield chain, server
 
 
 def test_the_eeprom_is_read_while_the_server_streams(bench: Bench) -> None:

@@ -27,18 +27,6 @@ def bench() -> Iterator[SimulatedBus]:
         yield bus
 
 
-@pytest.fixture
-def chain() -> Iterator[SimulatedBus]:
-    with simulated_bus("--sensors", "2", "--serial", "10,20", "--sinc", "512") as bus:
-        yield bus
-
-
-@pytest.fixture
-def single() -> Iterator[SimulatedBus]:
-    with simulated_bus("--signal", "rest", "--noise", "none") as bus:
-        yield bus
-
-
 def test_plan_says_what_would_change_and_writes_nothing(bench: SimulatedBus) -> None:
     near = bench.near
     asked = ("--set", "sinc_length=128", "--set", "fir=on", "--set", "imu_active=1")

@@ -11,11 +11,15 @@ from pathlib import Path
 from typing import Any, Final
 from unittest import mock
 
+from ethercat_server.sampling.observation import DistributedClock
 from ethercat_server.sampling.replay import Decision, Trace
+from ethercat_server.sampling.round_trip import RoundTrip
+from ethercat_server.sampling.sample_clock import SampleClock
+from ethercat_server.sampling.slave_clock import EventTimes
 from ethercat_server.sampling.trace import Clocks, RecordKind
 
 FOLDER: Final = Path(__file__).parent
-BEHIND_NS: Final = 100.0  # as if another slave were behind
+BEHIND_NS: Final = 200.0  # as if another slave were behind
 NAMES: Final = ("quiet", "loops", "slow", "stalls", "lies", "unplugged")
 DECISIONS: Final = FOLDER / "decisions.json"
 
@@ -24,22 +28,37 @@ def trace(name: str) -> Trace:
     return Trace(gzip.decompress((FOLDER / f"{name}.trace.gz").read_bytes()))
 
 
+def begin_anew(trace: Trace, state: Any, before: Clocks | None) -> Clocks:
+    """Not what a snapshot says, which is of older clocks, but such as know nothing, as a server starts.
+
+    Of those `before` the ones that did not begin anew here.
+    """
+    round_trip = before.round_trip if before else RoundTrip(state["round_trip"]["_wire_ns"])
+    clocks = list(before.sensors) if before else []
+    for number, each in enumerate(state["sensors"]):
+        if number < len(clocks) and each["_begun"]:
+            continue
+        events, offset_ns = each["events"], each["_data_offset_ns"]
+        if events is not None:
+            loop_ns = round(2 * events["_half_loop_ns"] + BEHIND_NS)
+            slave = DistributedClock(events["_offset"], loop_ns, events["_reading_ns"])
+            events = EventTimes(slave, round_trip, offset_ns)
+        period_ns = 1e9 / trace.about["sensors"][number]["nominal_hz"]
+        clocks[number : number + 1] = [SampleClock(period_ns, round_trip, events, offset_ns)]
+    return Clocks(round_trip, clocks)
+
+
 def decisions(name: str) -> dict[str, int]:
     """Counts of samples and exchanges; ages of samples in µs; means of what the clocks know, in ns."""
     given, made = trace(name), list[Clocks]()
-    for _, state in given._snapshots:
-        for sensor in state["sensors"]:
-            if sensor["events"]:
-                sensor["events"]["_half_loop_ns"] += BEHIND_NS
-    begin = given._begin_anew
 
-    def begun(*known: Any) -> Clocks:
-        made.append(begin(*known))
+    def begun(state: Any) -> Clocks:
+        made.append(begin_anew(given, state, made[-1] if made else None))
         return made[-1]
 
-    with mock.patch.object(given, "_begin_anew", begun):
+    with mock.patch("ethercat_server.sampling.replay.clocks_of", begun):
         steps, known = [], [0.0] * len(KNOWN)
-        for step in given.replay(anew=True):
+        for step in given.replay():
             steps.append(step)
             for place, value in enumerate(_known(made[-1], step)):
                 known[place] += value

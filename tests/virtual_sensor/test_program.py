@@ -131,11 +131,6 @@ def test_it_says_when_it_is_ready_and_how_it_ends_and_each_interface_has_serial_
     assert ending.wait() == 0
 
 
-def test_loopback_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["lo"]) == 1
-    assert "lo is the loopback interface" in capsys.readouterr().err
-
-
 @pytest.mark.bus
 def test_the_control_socket(
     veth: tuple[str, str], start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]

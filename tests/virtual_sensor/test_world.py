@@ -157,6 +157,7 @@ def test_a_seed_gives_a_run_to_the_bit() -> None:
         )
         simulation.at(0.5, "skip 3")
         simulation.at(1.0, "noise force.x 3")
+        simulation.at(2.0, "power cycle 0.2")
         simulation.run(3.0)
         return [frame.process_data + frame.monotonic_ns.to_bytes(8) for frame in simulation.frames]
 

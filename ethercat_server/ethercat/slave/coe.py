@@ -8,7 +8,6 @@ Sources: ETG.1000.6 (abort codes: table "SDO Abort Codes"), CiA 301.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import struct
 from collections import defaultdict
@@ -22,8 +21,6 @@ from ethercat_server.ethercat.datagrams import Registers, Steps, T
 
 log = logging.getLogger(__name__)
 
-_SHORTEST: Final = 16
-_LONGEST: Final = 1486
 _HEADER: Final = struct.Struct("<HHBB")
 _TYPE_COE: Final = 3
 _SDO_HEADER: Final = struct.Struct("<HBHB")
@@ -244,11 +241,6 @@ class MailboxSdo:
         self._name = name or f"sensor {number}"
         self.clock = bus.clock
         (self._out, self._out_size), (self._in, self._in_size) = areas
-        if not all(size == 0 or _SHORTEST <= size <= _LONGEST for _, size in areas):  # 0: it has none
-            raise BusError(
-                f"{self._name} has mailboxes of {self._out_size} and {self._in_size} bytes, which no "
-                "frame can carry: power it off and on"
-            )
         self._counter = 0
         self._in_use = False
         # Until when it is certain that the slave takes the next counter, and that no late answer comes.
@@ -302,11 +294,9 @@ class MailboxSdo:
         finally:
             self._in_use = False
 
-    def synchronize(self) -> Steps[None]:
+    def fall_out_of_step(self) -> None:
         """To be called when another user of the mailbox has counted on."""
         self._in_step = None
-        with contextlib.suppress(SdoAbortError):
-            yield from self.read(*_PROBED)
 
     def _ask(self, index: int, subindex: int, command: int, data: bytes) -> Steps[tuple[int, bytes]]:
         """The answer to a request, which is sent once the mailbox is in step.
