@@ -60,8 +60,8 @@ class LiveWindows:
         self._in_force: InForce | None = None
         self._never = threading.Event()
         self._clocks = Rows(_STAMPS)  # of the samples that are kept, since the clock was set back last
-        # Of the newest sample: its place, and by how much later it arrived, by this machine's clock.
-        self._newest_ns = self._behind_ns = 0
+        # Of the newest sample: stamp, place, and by how much later it arrived, by this machine's clock.
+        self._stamp_ns = self._newest_ns = self._behind_ns = 0
 
     def at(
         self, stamp_ns: int | None = None, *, monotonic_ns: int | None = None, timeout_s: float = 0.05
@@ -107,14 +107,15 @@ class LiveWindows:
         """On the axis of the windows; -1 if nothing is known."""
         if monotonic_ns is not None:
             return monotonic_ns + self._shift_ns
-        clocks = self._clocks.array
-        if stamp_ns is None or not len(clocks):
+        if stamp_ns is None or not self._newest_ns:
             return self._windows.until_ns
+        if stamp_ns >= self._stamp_ns:
+            return self._newest_ns + stamp_ns - self._stamp_ns
+        clocks = self._clocks.array
         behind = int(np.searchsorted(clocks["stamp_ns"], stamp_ns))
         near: list[tuple[int, int]] = clocks[max(behind - 1, 0) : behind + 1].tolist()
         (stamp, instant), (later, then) = near[0], near[-1]
-        rate = (then - instant) / (later - stamp) if later > stamp else 1.0
-        return instant + round((stamp_ns - stamp) * rate)
+        return instant + round((stamp_ns - stamp) * ((then - instant) / (later - stamp) if behind else 1.0))
 
     def _take(self, items: list[Item]) -> None:
         frames = list[DataMessage]()
@@ -141,7 +142,7 @@ class LiveWindows:
             if len(back := np.flatnonzero(latest[1:] < latest[:-1])):  # before, the same times were
                 self._clocks.take(len(self._clocks) - len(latest) + int(back[-1]) + 1)
         self._shift_ns, clocks = self._axis.shift_ns, self._clocks.array["monotonic_ns"]
-        self._newest_ns = int(clocks[-1]) if len(clocks) else 0
+        self._stamp_ns, self._newest_ns = self._clocks.array[-1].tolist() if len(clocks) else (0, 0)
         oldest_ns = self._windows.until_ns - self._keep_ns
         if len(clocks) and clocks[0] <= oldest_ns - self._keep_ns // 2:  # now and then is enough
             self._windows.forget(oldest_ns)

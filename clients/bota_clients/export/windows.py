@@ -103,6 +103,7 @@ class Windows:
 
     Attributes:
         begin_ns: stamp of the first sample; -1 before it.
+        until_ns: last instant of which nothing that comes later can be a part; -1 before the first sample.
         tool: parameters of the node; None: there is no compensated wrench.
         stream: what compensates; None without a tool.
     """
@@ -119,7 +120,7 @@ class Windows:
         self._length, self.imu_units = length, imu_units
         self.stream: CompensatedStream | None = None
         self._slots = Rows(_SLOT)
-        self._until_ns = np.full(3, -1)  # by channel: the latest measured
+        self._latest_ns, self.until_ns = np.full(3, -1), -1  # the first by channel: the latest measured
         self._newest = (0, 0)  # stamp and sequence of the newest sample
         self._taken = self._epoch = 0  # samples; of what is in force
         self._begins = False  # another stream, which the first sample after a pause need not say
@@ -164,11 +165,6 @@ class Windows:
         """How long before an offset was reported samples may have part of it; 0 without a tool."""
         return self._doubt_ns
 
-    @property
-    def until_ns(self) -> int:
-        """The last instant of which nothing that comes later can be a part; -1 before the first sample."""
-        return int(self._until_ns.min())
-
     def add(self, frames: Columns) -> Columns:
         """Take the next frames of the sensor, also REPEATED and INVALID ones; the samples. RecordingError."""
         is_fresh = frames.fresh
@@ -189,8 +185,9 @@ class Windows:
         if is_gap.any():
             slots = self._spread(slots, passed, further, is_gap)
         np.maximum.accumulate(slots["measured_ns"], axis=0, out=slots["latest_ns"])
-        slots["latest_ns"] = np.maximum(slots["latest_ns"], self._until_ns)
-        self._until_ns = slots["latest_ns"][-1]
+        slots["latest_ns"] = np.maximum(slots["latest_ns"], self._latest_ns)
+        self._latest_ns = slots["latest_ns"][-1]
+        self.until_ns = min(self._latest_ns.tolist())
         self._slots.add(slots)
         return samples
 
