@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping
 from itertools import chain
 from pathlib import Path
 
-from bota_clients.recording.writer import DiskFile, RecordingWriter
+from bota_clients.recording.disk_file import DiskFile
+from bota_clients.recording.writer import RecordingWriter
 from bota_ethercat import pdo
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.text.json_text import JsonObject

@@ -17,9 +17,10 @@ from bota_clients.export import dataset
 from bota_clients.export.cli import main as export
 from bota_clients.identify.cli import main as identify
 from bota_clients.recording.columns import columns
+from bota_clients.recording.disk_file import DiskFile
 from bota_clients.recording.order import TimeAxis, longest_order
 from bota_clients.recording.reader import open_recording
-from bota_clients.recording.writer import DiskFile, RecordingWriter
+from bota_clients.recording.writer import RecordingWriter
 from bota_clients.report.checks import Examination
 from bota_clients.report.cli import main as report
 from bota_clients.report.series import of_recording
