@@ -17,6 +17,7 @@ import argparse
 import itertools
 import json
 import sys
+from array import array
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 from xml.etree import ElementTree
@@ -212,7 +213,7 @@ def _robot_rates(path: Path, topic: str, urdf: Path | None, link: str) -> tuple[
     """
     joints = [] if urdf is None else _chain(urdf, link)
     turning = list(dict.fromkeys(joint.follows for joint in joints if joint.axis.any()))
-    stamps, rows, left_out = list[int](), list[list[float]](), 0
+    stamps, rows, left_out = array("q"), array("d"), 0
     for stamp, message in messages(path, topic):
         if hasattr(message, "angular_velocity"):
             rate, joints = message.angular_velocity, []
@@ -227,17 +228,21 @@ def _robot_rates(path: Path, topic: str, urdf: Path | None, link: str) -> tuple[
             row = [at[name] for name in turning if name in at]
         if len(row) == (len(turning) if joints else 3) and np.isfinite(row).all():
             stamps.append(stamp)
-            rows.append(row)
+            rows.extend(row)
         else:
             left_out += 1
-    times = np.array(stamps, np.int64)
+    times = np.frombuffer(stamps, np.int64)
     kept = in_order(times)
     if len(times) < 2 or (~kept).mean() > MOST_LEFT_OUT:
         which = f", but for {left_out} that do not tell how the link turned," if left_out else ""
         raise RecordingError(
             f"the messages of {topic} in {path}{which} are too few, or not in the order of their stamps"
         )
-    times, values, left_out = times[kept], np.array(rows)[kept], left_out + int((~kept).sum())
+    times, values, left_out = (
+        times[kept],
+        np.array(rows).reshape(len(times), -1)[kept],
+        left_out + int((~kept).sum()),
+    )
     if not joints:
         return times, values, left_out
     angles = dict(zip(turning, values.T, strict=True))

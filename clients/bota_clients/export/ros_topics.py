@@ -8,6 +8,7 @@ not finite. Covariances are 0, unknown (REP 145).
 from __future__ import annotations
 
 import argparse
+import struct
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
@@ -45,21 +46,13 @@ class Topic(NamedTuple):
     valid: str = ""  # a column that says whether the others may be used
 
     def message(self) -> bytes:
-        """With the numbers of none."""
-        types = _STORE.types
-        time = types["builtin_interfaces/msg/Time"](0, 0)
-        header = types["std_msgs/msg/Header"](time, self.frame)
-        x_y_z, nothing = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0), np.zeros(9)
-        made = types[self.kind]
-        if self.kind.endswith("WrenchStamped"):
-            made = made(header, types["geometry_msgs/msg/Wrench"](x_y_z, x_y_z))
-        elif self.kind.endswith("Imu"):
-            no_orientation = np.array([-1.0, *[0.0] * 8])
-            turned = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 0.0)
-            made = made(header, turned, no_orientation, x_y_z, nothing, x_y_z, nothing)
-        else:
-            made = made(header, 0.0, 0.0)
-        return bytes(_STORE.serialize_cdr(made, self.kind))
+        """In CDR, little-endian, with a stamp and numbers of 0."""
+        text = self.frame.encode() + b"\0"
+        head = bytes(8) + struct.pack("<I", len(text)) + text
+        numbers = np.zeros(_NUMBERS.get(self.kind, 2))
+        if self.kind == _IMU:
+            numbers[4] = -1.0  # the covariance of an orientation that there is not
+        return b"\0\1\0\0" + head + bytes(-len(head) % 8) + numbers.tobytes()
 
 
 _WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
