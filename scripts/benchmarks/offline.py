@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from bota_clients.recording.disk_file import DiskFile
+from bota_clients.recording.mcap_writer import DiskFile
 from bota_clients.recording.writer import RecordingWriter
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import encode

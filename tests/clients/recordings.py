@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from itertools import chain
 from pathlib import Path
 
-from bota_clients.recording.disk_file import DiskFile
+from bota_clients.recording.mcap_writer import DiskFile
 from bota_clients.recording.writer import RecordingWriter
 from bota_ethercat import pdo
 from bota_ethercat.framing import DataMessage

@@ -9,17 +9,16 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from bota_clients.recording import disk_file
-from bota_clients.recording.disk_file import DiskFile
-from bota_clients.recording.mcap_writer import McapWriter, message_rows
+from bota_clients.recording import mcap_writer
+from bota_clients.recording.mcap_writer import DiskFile, McapWriter, message_rows
 from tests.clients.recordings import START_NS
 
 DATA_END = b"\x0f\x04\0\0\0\0\0\0\0"
 
 
 def test_a_file_is_that_of_the_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """To the byte up to the list of groups at its end, of which the library names empty ones, too."""
-    monkeypatch.setattr(disk_file, "_KEPT_IN_MEMORY", 100)  # the index of two chunks is longer
+    """To the byte up to the end of the data, and the summary behind it."""
+    monkeypatch.setattr(mcap_writer, "_KEPT_IN_MEMORY", 100)  # the index of two chunks is longer
     ours, theirs = tmp_path / "ours.mcap", tmp_path / "theirs.mcap"
     made = McapWriter(disk := DiskFile(ours, overwrite=False), "ros2", "test")
     library = Writer(str(theirs), 1 << 30, CompressionType.ZSTD, enable_data_crcs=True)

@@ -16,9 +16,9 @@ import pytest
 from bota_clients.export import dataset
 from bota_clients.export.cli import main as export
 from bota_clients.identify.cli import main as identify
-from bota_clients.recording import disk_file
+from bota_clients.recording import mcap_writer
 from bota_clients.recording.columns import columns
-from bota_clients.recording.disk_file import DiskFile
+from bota_clients.recording.mcap_writer import DiskFile
 from bota_clients.recording.order import TimeAxis, longest_order
 from bota_clients.recording.reader import open_recording
 from bota_clients.recording.writer import RecordingWriter
@@ -256,7 +256,7 @@ def test_of_a_chunk_little_is_kept_by_who_writes_it_and_who_reads_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two and a half come every second."""
-    monkeypatch.setattr(disk_file, "_KEPT_IN_MEMORY", 1000)
+    monkeypatch.setattr(mcap_writer, "_KEPT_IN_MEMORY", 1000)
     kept = []
     for count in (200, 1200):
         path = tmp_path / f"{count}.mcap"

@@ -21,8 +21,7 @@ from bota_clients.export.samples import MOST_LOST, in_part, samples_of
 from bota_clients.export.windows import Arrays
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
-from bota_clients.recording.disk_file import whole_file
-from bota_clients.recording.mcap_writer import McapWriter, message_rows
+from bota_clients.recording.mcap_writer import McapWriter, message_rows, whole_file
 from bota_clients.recording.order import TimeAxis
 from bota_clients.recording.reader import Recording
 from bota_ethercat.program.version import VERSION

@@ -11,8 +11,8 @@ import argparse
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import PROGRAM
 from bota_clients.numbers import count
-from bota_clients.recording.disk_file import whole_file
 from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
+from bota_clients.recording.mcap_writer import whole_file
 from bota_clients.recording.reader import Recording
 from bota_clients.recording.writer import RecordingWriter
 from bota_ethercat.program.version import VERSION

@@ -23,8 +23,8 @@ from rich.filesize import decimal
 
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
-from bota_clients.recording.disk_file import DiskFile
 from bota_clients.recording.file_format import RECORDER, RecordedDescription, RecordedEvent
+from bota_clients.recording.mcap_writer import DiskFile
 from bota_clients.recording.writer import RecordingWriter
 from bota_ethercat.accounting import StreamAccounting, StreamCounts
 from bota_ethercat.address import Address

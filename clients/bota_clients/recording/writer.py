@@ -13,8 +13,7 @@ import numpy as np
 
 from bota_clients.recording import file_format
 from bota_clients.recording.columns import Table
-from bota_clients.recording.disk_file import DiskFile
-from bota_clients.recording.mcap_writer import McapWriter
+from bota_clients.recording.mcap_writer import DiskFile, McapWriter
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.text.json_text import JsonObject
 
