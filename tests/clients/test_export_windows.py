@@ -86,8 +86,11 @@ def test_a_step_of_the_wall_clock_in_the_middle_bends_nothing(tmp_path: Path, st
     assert made["stamp_ns"].tolist() == times.tolist()
 
 
-def tared(path: Path, told: Sequence[Any], steps: Sequence[float]) -> Path:
-    """A second at each of these forces along x, of which the sensor tells that its own offset is so."""
+def tared(path: Path, told: Sequence[Any], steps: Sequence[float], *between: Any) -> Path:
+    """A second at each of these forces along x, of which the sensor tells that its own offset is so.
+
+    `between` is what follows each frame.
+    """
     row = describe(0, **SETTINGS)
     row["sensors"][0] |= {} if told[0] is None else {"offset": [told[0], 0, 0, 0, 0, 0]}
     items: list[Any] = [row]
@@ -96,9 +99,24 @@ def tared(path: Path, told: Sequence[Any], steps: Sequence[float]) -> Path:
             six = None if offset is None else [offset, 0, 0, 0, 0, 0]
             items.append({"event": "offset_changed", "sensor": 0, "offset": six})
         values: Any = {"force.x": force}
-        items += [frame(number, **values) for number in range(800 * part, 800 * (part + 1))]
+        for number in range(800 * part, 800 * (part + 1)):
+            items += [frame(number, **values), *between]
     write(path, items)
     return path
+
+
+def test_where_batches_end_changes_no_window(tmp_path: Path) -> None:
+    """Each frame is one; none has a sample that a change puts in doubt, which is told only later."""
+    tool = {"tool_mass": 0.0, "tool_center_of_gravity": [0, 0, 0], "bias": [1.0, 0, 0, 0, 0, 0]}
+    path = tared(tmp_path / "run.mcap", (1.0, 2.0), (5.0, 6.0), {"event": "told"})
+    at = np.arange(600, 900) + 0.5
+    with open_recording(path) as recording:
+        windows = Windows(1, tool=tool | {"sensor_offset": [1.0, 0, 0, 0, 0, 0]})
+        made = joined(windows_of(recording, Stamped(stamps(*at)), windows))
+    assert made["monotonic_ns"] == pytest.approx(at * PERIOD_NS, abs=1)
+    assert made["force_torque_valid"].all()
+    doubted = at[~made["force_torque_compensated_valid"][:, 0]]
+    assert doubted.tolist() == [*np.arange(717, 800) + 0.5]
 
 
 @pytest.mark.parametrize(
