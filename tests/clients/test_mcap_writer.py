@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -9,16 +11,24 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from bota_clients.recording import mcap_writer
 from bota_clients.recording.mcap_writer import DiskFile, McapWriter, message_rows
 from tests.clients.recordings import START_NS
+
+
+def fail(**_: object) -> None:
+    raise OSError(errno.ENOTSUP, "Operation not supported")
+
 
 DATA_END = b"\x0f\x04\0\0\0\0\0\0\0"
 
 
-def test_a_file_is_that_of_the_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("is_lacking", [False, True])
+def test_a_file_is_that_of_the_library(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_lacking: bool
+) -> None:
     """To the byte up to the end of the data, and the summary behind it."""
-    monkeypatch.setattr(mcap_writer, "_KEPT_IN_MEMORY", 100)  # the index of two chunks is longer
+    if is_lacking:  # a file system without files that have no name
+        monkeypatch.setattr(tempfile, "TemporaryFile", fail)
     ours, theirs = tmp_path / "ours.mcap", tmp_path / "theirs.mcap"
     made = McapWriter(disk := DiskFile(ours, overwrite=False), "ros2", "test")
     library = Writer(str(theirs), 1 << 30, CompressionType.ZSTD, enable_data_crcs=True)

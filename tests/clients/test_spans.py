@@ -16,7 +16,6 @@ import pytest
 from bota_clients.export import dataset
 from bota_clients.export.cli import main as export
 from bota_clients.identify.cli import main as identify
-from bota_clients.recording import mcap_writer
 from bota_clients.recording.columns import columns
 from bota_clients.recording.mcap_writer import DiskFile
 from bota_clients.recording.order import TimeAxis, longest_order
@@ -252,11 +251,8 @@ def test_memory_does_not_grow_with_the_length(
     assert peaks[1] < max(1.1 * peaks[0], peaks[0] + (4 << 20))
 
 
-def test_of_a_chunk_little_is_kept_by_who_writes_it_and_who_reads_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_a_chunk_little_is_kept_by_who_writes_it_and_who_reads_it(tmp_path: Path) -> None:
     """Two and a half come every second."""
-    monkeypatch.setattr(mcap_writer, "_KEPT_IN_MEMORY", 1000)
     kept = []
     for count in (200, 1200):
         path = tmp_path / f"{count}.mcap"

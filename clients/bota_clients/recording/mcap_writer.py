@@ -7,6 +7,7 @@ hour, makes objects of every message, and takes messages only one by one.
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import struct
 import tempfile
@@ -14,7 +15,7 @@ import zlib
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +36,6 @@ else:
     _LOCKS = True
 
 _BINARY: Final = getattr(os, "O_BINARY", 0)  # Windows would write other line ends
-_KEPT_IN_MEMORY: Final = 1024 * 1024  # bytes
 _CHUNK: Final = 1024 * 1024  # bytes, before compression
 _ENTRY: Final = struct.Struct("<QQ")  # of a message in a chunk: log time, position
 
@@ -81,8 +81,10 @@ class DiskFile:
             raise RecordingError(f"{path} {EXISTS}") from None
         except OSError as error:
             raise self._failed(error) from None
-        beside = str(path.parent) if path.is_file() else None  # not that of a device
-        self._kept = tempfile.SpooledTemporaryFile(_KEPT_IN_MEMORY, dir=beside)  # noqa: SIM115 - see close
+        self._kept: IO[bytes] = io.BytesIO()
+        with contextlib.suppress(OSError):  # some file systems remove no open file
+            beside = path.parent if path.is_file() else None  # not that of a device
+            self._kept = tempfile.TemporaryFile(dir=beside)  # noqa: SIM115 - see close
         self._counts_links = os.fstat(self._fd).st_nlink > 0  # some file systems do not
 
     def write(self, data: bytes) -> None:
@@ -94,7 +96,7 @@ class DiskFile:
         return self._position
 
     def keep(self, data: bytes) -> None:
-        """Hold for the end of the file, on disk if it is much; RecordingError."""
+        """Hold for the end of the file, in another one without a name; RecordingError."""
         try:
             self._kept.write(data)
         except OSError as error:
