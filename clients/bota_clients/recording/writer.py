@@ -55,11 +55,8 @@ class RecordingWriter:
         made = frames.copy()
         for sensor in np.unique(made["sensor"]).tolist():
             made["channel"][made["sensor"] == sensor] = self._frame_channel(sensor)
-        made["number"], made["logged"], made["published"] = (
-            made["sequence"],
-            made["stamp_ns"],
-            made["stamp_ns"],
-        )
+        made["number"], made["logged"] = made["sequence"], made["stamp_ns"]
+        made["published"] = made["stamp_ns"]
         self._mcap.messages(made.view(np.uint8).reshape(len(made), -1))
         self.frames += len(made)
 
