@@ -37,12 +37,12 @@ def test_a_file_is_that_of_the_library(
         assert made.channel(topic, schema, schema.lower(), more=topic) == number
         of = library.register_schema(schema, "ros2msg", schema.lower().encode())
         assert library.register_channel(topic, "cdr", of, {"more": topic}) == number
-    for name in ("first", "last"):
+    for begin_ns, name in enumerate(("first", "last"), START_NS):
         made.metadata(name, {"k": name})
         library.add_metadata(name, {"k": name})
         for part in range(3):
-            made.message(2, START_NS - part, b"one", 7)
-            library.add_message(2, START_NS - part, b"one", START_NS - part, 7)
+            made.message(2, begin_ns - part, b"one", 7)
+            library.add_message(2, begin_ns - part, b"one", begin_ns - part, 7)
             # Of two lengths, in turns, the shorter ones padded.
             stamps, bodies = START_NS + np.arange(9), np.arange(45, dtype=np.uint8).reshape(9, 5)
             rows = message_rows(1, stamps, bodies, 10 * part)
@@ -72,7 +72,8 @@ def test_chunks_are_bounded(tmp_path: Path) -> None:
     made = McapWriter(disk := DiskFile(tmp_path / "a.mcap", overwrite=False), "", "test")
     made.channel("/a", "A", "")
     made.channel("/b", "A", "")
-    made.messages(message_rows(1, np.arange(600), np.zeros((600, 2000), np.uint8), 0))
+    for _ in range(2):
+        made.messages(message_rows(1, np.arange(600), np.zeros((600, 2000), np.uint8), 0))
     for number in range(600):
         made.message(1, number, bytes(2000), number)
     made.finish()
@@ -81,5 +82,5 @@ def test_chunks_are_bounded(tmp_path: Path) -> None:
         summary = make_reader(file, validate_crcs=True).get_summary()
     assert summary
     assert summary.statistics
-    assert (len(summary.chunk_indexes), summary.statistics.message_count) == (3, 1200)
+    assert (len(summary.chunk_indexes), summary.statistics.message_count) == (4, 1800)
     assert [each.topic for each in summary.channels.values()] == ["/a", "/b"]

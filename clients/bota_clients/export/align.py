@@ -332,6 +332,7 @@ def run(options: argparse.Namespace) -> int:
             delay_s = angular_rate_response(in_force.info.settings).delay_s or 0.0
             rows.append((table.monotonic_ns - round(delay_s * 1e9), table.angular_rate))
     instants, rates = map(np.concatenate, zip(*rows, strict=True))
+    rows.clear()  # as much again
     for remark in axis.said:
         say(PROGRAM, f"{options.recording}: {remark}")
     stamps, robot_rates, left_out = _robot_rates(options.bag, options.topic, options.urdf, options.link)

@@ -193,8 +193,7 @@ class McapWriter:
         self._write(MAGIC + _packed(records.Header(profile, library)))
 
     def metadata(self, name: str, notes: Mapping[str, str]) -> None:
-        """Write a record of notes; what is in the chunk comes before it."""
-        self._end_chunk()
+        """Write a record of notes, before what is not flushed."""
         record = _packed(records.Metadata(name, dict(notes)))
         self._metadata.append(_packed(records.MetadataIndex(self._disk.tell(), len(record), name)))
         self._write(record)
