@@ -14,7 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from bota_clients.recording.writer import DiskFile, RecordingWriter
+from bota_clients.recording.mcap_writer import DiskFile
+from bota_clients.recording.writer import RecordingWriter
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import encode
 from bota_ethercat.program.arguments import number

@@ -17,8 +17,9 @@ from bota_clients.monitor.compensated import NewestCompensated
 from bota_clients.monitor.model import Model
 from bota_clients.monitor.reader import MonitorReader
 from bota_clients.recording.file_format import RecordedDescription
+from bota_clients.recording.mcap_writer import DiskFile
 from bota_clients.recording.reader import open_recording
-from bota_clients.recording.writer import DiskFile, RecordingWriter
+from bota_clients.recording.writer import RecordingWriter
 from bota_clients.replay.sensors import ReplayedSensors
 from bota_clients.report.series import Series, of_recording
 from bota_ethercat.accounting import NOT_NEW

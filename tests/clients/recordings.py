@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping
 from itertools import chain
 from pathlib import Path
 
-from bota_clients.recording.writer import DiskFile, RecordingWriter
+from bota_clients.recording.mcap_writer import DiskFile
+from bota_clients.recording.writer import RecordingWriter
 from bota_ethercat import pdo
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.text.json_text import JsonObject
@@ -41,7 +42,8 @@ def write(
 
     With a chunk for so many frames. `end` are the notes at its end; None: it is cut off.
     """
-    made, now_ns, frames = RecordingWriter(DiskFile(path, overwrite=True), "test", notes), START_NS, 0
+    disk = DiskFile(path, overwrite=True)
+    made, now_ns, frames = RecordingWriter(disk, "test", notes), START_NS, 0
     for item in items:
         if not isinstance(item, DataMessage):
             (made.event if "event" in item else made.describe)(now_ns, item)
@@ -52,6 +54,7 @@ def write(
             made.flush()
     if end is not None:
         made.finish(end)
+    disk.close()
 
 
 def record(

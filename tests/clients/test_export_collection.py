@@ -73,6 +73,15 @@ def test_what_is_unchanged_is_left_and_what_is_bad_is_named(runs: list[Path], tm
     assert not [*folder.glob(".unfinished*")]
 
 
+def test_of_what_has_nothing_in_a_part_nothing_is_left(runs: list[Path], tmp_path: Path) -> None:
+    """Of the whole, which is there from before."""
+    folder = tmp_path / "data"
+    data_set(*runs[:2], f"{folder}/")
+    said = data_set(*runs[:2], folder, "--from", "0.1", code=1)
+    assert f"{runs[1]} has nothing from 0.1" in said
+    assert {row["recording"] for row in dataset.dataset(folder).to_table().to_pylist()} == {"one.mcap"}
+
+
 def test_a_name_in_another_encoding_is_no_obstacle(runs: list[Path], tmp_path: Path) -> None:
     """As of a file from another machine."""
     other = runs[0].rename(tmp_path / os.fsdecode(b"caf\xe9.mcap"))

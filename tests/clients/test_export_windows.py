@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import json
 import os
-import random
 import re
 import shutil
 import struct
@@ -22,12 +21,12 @@ import pytest
 
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import main, parse_options
-from bota_clients.export.dataset import Periodic, Stamped, messages, read_stamps, windows_of
+from bota_clients.export.dataset import Stamped, messages, read_stamps, windows_of
 from bota_clients.export.windows import Array, Arrays, Windows
 from bota_clients.recording.columns import columns
 from bota_clients.recording.reader import open_recording
 from bota_ethercat import client
-from bota_ethercat.framing import DataFlag, DataMessage
+from bota_ethercat.framing import DataMessage
 from bota_ethercat.replies import SensorInfo
 from bota_ethercat.settings import SettingValue
 from bota_ethercat.stream.timeline import InForce
@@ -37,8 +36,6 @@ from ethercat_server.simulation.server import MemoryChannel, Simulation
 from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.clients.bags import imu, write_bag
 from tests.clients.recordings import PERIOD_NS, START_NS, describe, frame, record, write
-from tests.clients.simulated import simulate
-from tests.descriptions import sensor_row
 from tests.ended import run_here
 
 SETTINGS: dict[str, Any] = {"fir": False, "acceleration_filter": 1, "angular_rate_filter": 3}
@@ -89,34 +86,11 @@ def test_a_step_of_the_wall_clock_in_the_middle_bends_nothing(tmp_path: Path, st
     assert made["stamp_ns"].tolist() == times.tolist()
 
 
-def test_a_stream_gives_what_its_recording_gives_to_the_bit(tmp_path: Path) -> None:
-    """The stream is without REPEATED frames, comes in other batches, and is asked as it comes."""
-    frames = simulate(3.0, at=((1.0, "stick"), (1.2, "unstick")), lost=0.02)
-    path, row, chance = tmp_path / "run.mcap", sensor_row(), random.Random(1)
-    record(path, frames, sensors=(0,), **row["settings"])
-    with open_recording(path) as recording:
-        recorded = joined(windows_of(recording, Periodic(30.0), Windows(32, tool=TOOL)))
-    live = Windows(32, tool=TOOL)
-    live.configure(recording.sensors[0].changes[0].in_force)
-    sent, asked, blocks = [each for each in frames if not each.flags & DataFlag.REPEATED], 0, []
-    while sent:
-        size = chance.randrange(1, 40)
-        live.add(columns(sent[:size]))
-        sent = sent[size:]
-        instants = recorded["monotonic_ns"][asked:]
-        ready = instants[: np.searchsorted(instants, live.until_ns, "right")]
-        if len(ready):
-            blocks.append(live.at(ready))
-            live.forget(int(ready[-1]))
-            asked += len(ready)
-    assert asked == len(recorded["monotonic_ns"]) > 80
-    assert not recorded["force_torque_valid"].all()
-    for name, array in joined(blocks).items():
-        assert array.tobytes() == recorded[name].tobytes(), name
+def tared(path: Path, told: Sequence[Any], steps: Sequence[float], *between: Any) -> Path:
+    """A second at each of these forces along x, of which the sensor tells that its own offset is so.
 
-
-def tared(path: Path, told: Sequence[Any], steps: Sequence[float]) -> Path:
-    """A second at each of these forces along x, of which the sensor tells that its own offset is so."""
+    `between` is what follows each frame.
+    """
     row = describe(0, **SETTINGS)
     row["sensors"][0] |= {} if told[0] is None else {"offset": [told[0], 0, 0, 0, 0, 0]}
     items: list[Any] = [row]
@@ -125,24 +99,24 @@ def tared(path: Path, told: Sequence[Any], steps: Sequence[float]) -> Path:
             six = None if offset is None else [offset, 0, 0, 0, 0, 0]
             items.append({"event": "offset_changed", "sensor": 0, "offset": six})
         values: Any = {"force.x": force}
-        items += [frame(number, **values) for number in range(800 * part, 800 * (part + 1))]
+        for number in range(800 * part, 800 * (part + 1)):
+            items += [frame(number, **values), *between]
     write(path, items)
     return path
 
 
-def test_a_bias_goes_with_the_sensors_own_offset(tmp_path: Path) -> None:
-    """Tared before the recording and in it; then nobody knows the offset, and then it is known again."""
-    tool = {"tool_mass": 0.0, "tool_center_of_gravity": [0, 0, 0], "bias": [3.0, 0, 0, 0, 0, 0]}
-    path = tared(tmp_path / "run.mcap", (-1.0, -9.3, None, 4.0), (1.0, -7.3, 5.0, 6.0))
+def test_where_batches_end_changes_no_window(tmp_path: Path) -> None:
+    """Each frame is one; none has a sample that a change puts in doubt, which is told only later."""
+    tool = {"tool_mass": 0.0, "tool_center_of_gravity": [0, 0, 0], "bias": [1.0, 0, 0, 0, 0, 0]}
+    path = tared(tmp_path / "run.mcap", (1.0, 2.0), (5.0, 6.0), {"event": "told"})
+    at = np.arange(600, 900) + 0.5
     with open_recording(path) as recording:
-        windows = Windows(3200, tool=tool | {"sensor_offset": [1.0, 0, 0, 0, 0, 0]})
-        made = joined(windows_of(recording, Stamped(stamps(3196)), windows))
-    valid = made["force_torque_compensated_valid"][0]
-    assert abs(made["force_torque_compensated"][0][valid]).max() < 1e-5
-    assert made["force_torque_valid"][0].sum() == 3198, "all that were measured before that"
-    parts = [int(part.sum()) for part in np.split(valid, [802, 1602, 2402])]
-    # In doubt are 0.1 s before a change is told, in which it is written, and two samples after it.
-    assert parts == [pytest.approx(720, abs=4), pytest.approx(797, abs=3), 0, pytest.approx(797, abs=3)]
+        windows = Windows(1, tool=tool | {"sensor_offset": [1.0, 0, 0, 0, 0, 0]})
+        made = joined(windows_of(recording, Stamped(stamps(*at)), windows))
+    assert made["monotonic_ns"] == pytest.approx(at * PERIOD_NS, abs=1)
+    assert made["force_torque_valid"].all()
+    doubted = at[~made["force_torque_compensated_valid"][:, 0]]
+    assert doubted.tolist() == [*np.arange(717, 800) + 0.5]
 
 
 @pytest.mark.parametrize(

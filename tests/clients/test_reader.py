@@ -73,26 +73,40 @@ def test_frames_come_back_byte_for_byte(path: Path) -> None:
     assert (found.flags.tolist(), found.wkc.tolist()) == ([255], [65535])
 
 
-def test_settings_are_known_over_time(path: Path) -> None:
+def test_settings_and_offsets_are_in_force_since_they_were_told_first(path: Path) -> None:
+    six = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     first, then = describe(0, chop=False), describe(0)
     first["sensors"][0]["serial"] = 2**32 - 1
     then["sensors"][0] |= {"settings": {"sinc_length": 32}, "rate_hz": 1600, "serial": 2**32 - 1}
-    event: Any = {"event": "reconfigured", "sensor": 0, "settings": {"sinc_length": 32}}
-    write(path, [first, frame(8), event, then, frame(9)], end={"reason": "asked to"})
+    told: Any = {"event": "offset_changed", "sensor": 0, "offset": six}
+    event: Any = {"event": "reconfigured", "sensor": 0, "settings": {"sinc_length": 32}, "offset": six}
+    items = [first, frame(7), told, frame(8), event, then, frame(9), describe(0, chop=True), frame(10)]
+    write(path, items, end={"reason": "asked to"})
     with open_recording(path) as recording:
         (sensor,) = recording.sensors
         assert sensor.info.serial == 2**32 - 1
         assert sensor.info.settings == {"sinc_length": 64, "chop": False}
-        history = [
-            (at - START_NS, now.info.settings["sinc_length"], now.info.rate_hz) for at, now in sensor.history
-        ]
-        assert history == [(0, 64, 800), (8 * PERIOD_NS, 32, 1600)]
         assert [type(item) for item in recording.everything()] == [
-            RecordedDescription, DataMessage, RecordedEvent, RecordedDescription, DataMessage,
+            RecordedDescription, DataMessage, RecordedEvent, DataMessage, RecordedEvent, RecordedDescription,
+            DataMessage, RecordedDescription, DataMessage,
         ]  # fmt: skip
-        assert recording.events[0].name == "reconfigured"
-        assert not recording.events[0].by_recorder
+        assert [each.name for each in recording.events] == ["offset_changed", "reconfigured"]
+        assert not recording.events[1].by_recorder
         assert recording.end == {"reason": "asked to"}
+    history, offsets = (
+        [
+            (
+                (at - START_NS) // PERIOD_NS,
+                now.info.settings["sinc_length"],
+                now.info.rate_hz,
+                now.info.offset,
+            )
+            for at, now in each
+        ]
+        for each in (sensor.history, sensor.offsets)
+    )
+    assert history == [(0, 64, 800, tuple(six)), (8, 32, 1600, None), (9, 64, 800, None)]
+    assert offsets == [(0, 64, 800, None), (7, 64, 800, tuple(six)), (8, 32, 1600, None)]
 
 
 def test_columns_are_what_the_decoder_gives(path: Path) -> None:
@@ -325,23 +339,21 @@ def test_an_empty_tail_after_a_power_failure_is_left_out(path: Path) -> None:
 # -- damaged and hostile
 
 
-def test_other_files_and_what_was_cut_off_before_the_first_chunk_are_refused(path: Path) -> None:
+def test_what_is_no_recording_or_not_there_is_refused(path: Path) -> None:
     whole = path.read_bytes()
     no_recording = "is not an MCAP file|was cut off before anything was recorded"
     for what in (b"", b"x", b"hello, I am no MCAP file", bytes(4096), whole[:7], whole[:8], whole[:20]):
         path.write_bytes(what)
         with pytest.raises(RecordingError, match=no_recording):
             open_recording(path)
-
-
-def test_what_is_not_there_or_another_format_is_said(path: Path) -> None:
     write(path, [], format="99")
-    with pytest.raises(RecordingError, match="'99'"):
-        open_recording(path)
-    with pytest.raises(RecordingError, match="No such file"):
-        open_recording(path.with_name("no.mcap"))
-    with pytest.raises(RecordingError, match="directory"):
-        open_recording(path.parent)
+    for named, said in (
+        (path, "'99'"),
+        (path.with_name("no.mcap"), "No such file"),
+        (path.parent, "directory"),
+    ):
+        with pytest.raises(RecordingError, match=said):
+            open_recording(named)
     assert file_format.FORMAT_VERSION == "1"
 
 
@@ -471,22 +483,3 @@ def test_before_a_change_that_was_announced_no_sample_is_in_doubt(tmp_path: Path
     assert read.said == ["10 frames left out: the sensor's own offset was not known"]
     as_later = (found.force[[0, -1]].tolist(), found.torque[[0, -1]].tolist())
     assert as_later == ([[1, 2, 3], [1599, 0, 0]], [[4, -4, -5], [0, 0, 0]])
-
-
-def test_settings_are_in_force_since_they_were_told_first_and_offsets_likewise(tmp_path: Path) -> None:
-    six = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
-    items: list[Any] = [
-        describe(0),
-        frame(8),
-        {"event": "offset_changed", "sensor": 0, "offset": six},
-        frame(9),
-    ]
-    write(path := tmp_path / "run.mcap", [*items, describe(0, chop=True), frame(10)])
-    with open_recording(path) as recording:
-        (sensor,) = recording.sensors
-    rows = [
-        [((at - START_NS) // PERIOD_NS, now.info.settings.get("chop"), now.info.offset) for at, now in each]
-        for each in (sensor.history, sensor.offsets)
-    ]
-    assert rows[0] == [(0, None, tuple(six)), (9, True, None)]
-    assert rows[1] == [(0, None, None), (8, None, tuple(six)), (9, True, None)]

@@ -16,6 +16,7 @@ from bota_ethercat.framing import DataFlag, DataMessage
 from tests.clients.recordings import write
 from tests.clients.simulated import simulate
 from tests.descriptions import description, sensor_row
+from tests.ended import Result, run_here
 
 SINC, SPLIT = 128, 600
 
@@ -39,19 +40,11 @@ SENSOR: Final = description(sensor_row(sinc_length=SINC))
 class Report:
     """The program with one recording: what it prints, and the page."""
 
-    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        self.folder, self._capsys = folder, capsys
-        self.path, self.out = folder / "cell.mcap", folder / "cell.html"
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.path, self.out = folder, folder / "cell.mcap", folder / "cell.html"
 
-    def run(self, *arguments: object) -> tuple[int, str, str]:
-        """Exit code, output and errors."""
-        try:
-            code = cli.main([str(argument) for argument in arguments])
-        except SystemExit as exit_:
-            code = int(str(exit_.code))
-        said = self._capsys.readouterr()
-        assert "Traceback" not in said.err
-        return code, said.out, said.err
+    def run(self, *arguments: object) -> Result:
+        return run_here(cli.main, *arguments)
 
     def of(self, *items: Frames | dict[str, object], **options: Any) -> tuple[int, str]:
         """Exit code and output with a recording of these."""
@@ -62,7 +55,7 @@ class Report:
         """Frames, descriptions and events, in this order."""
         write(self.path, chain(*([item] if isinstance(item, dict) else item for item in items)), **options)
 
-    def again(self, *options: object) -> tuple[int, str, str]:
+    def again(self, *options: object) -> Result:
         return self.run(self.path, "--force", *options)
 
     def lacks(self, *words: str) -> list[str]:
@@ -72,8 +65,8 @@ class Report:
 
 
 @pytest.fixture
-def report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Report:
-    return Report(tmp_path, capsys)
+def report(tmp_path: Path) -> Report:
+    return Report(tmp_path)
 
 
 def frames() -> tuple[DataMessage, ...]:

@@ -17,6 +17,8 @@ import argparse
 import itertools
 import json
 import sys
+from array import array
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 from xml.etree import ElementTree
@@ -57,6 +59,8 @@ _APART_S: Final = 0.5
 _OTHER: Final = 0.9  # of the highest correlation: another so far apart may be right, too
 _WIDEST_S: Final = 0.005
 _MOST_NAMED: Final = 40  # links
+_MOST: Final = 1_500_000  # samples or messages: of a longer recording each second, third, ... is taken
+_AT_ONCE: Final = 65_536  # poses
 # What a clock's course is compared with: polynomials by their degree, and a step wherever it fits best; with
 # the 99.7 % quantiles of F for 16 offsets.
 _BENDING: Final = {2: 13.2, 3: 9.8, 5: 8.5}
@@ -158,7 +162,7 @@ Stretches = list[tuple[Array, Array]]
 
 def _correlated(sensor: Stretches, robot: Stretches) -> tuple[Ints, Array]:
     """Lags in steps, ascending, and how well the rates agree at each, whatever the rotation."""
-    lags, products = list[Ints](), list[Array]()
+    lags, spectra = list[Ints](), list[tuple[Any, Any]]()
     both = []
     for each in (sensor, robot):
         longest = sorted(each, key=lambda part: -len(part[0]))[:_LONGEST]
@@ -168,14 +172,15 @@ def _correlated(sensor: Stretches, robot: Stretches) -> tuple[Ints, Array]:
         both.append([(int(grid[0]), columns - mean) for grid, columns in zip(grids, turned, strict=True)])
     for (felt_at, felt), (turned_at, turned) in itertools.product(*both):
         size = len(felt) + len(turned)
-        own, other = (np.fft.rfft(columns, size, axis=0) for columns in (felt, turned))
-        found = np.fft.irfft(own[:, :, np.newaxis] * other[:, np.newaxis].conj(), size, axis=0)
+        spectra.append((np.fft.rfft(felt, size, axis=0), np.fft.rfft(turned, size, axis=0).conj()))
         lags.append((np.arange(size) + len(turned)) % size - len(turned) + felt_at - turned_at)
-        products.append(found.reshape(size, -1))
     steps, of = np.unique(np.concatenate(lags), return_inverse=True)
-    total = np.zeros((len(steps), products[0].shape[1]))
-    np.add.at(total, of, np.concatenate(products))
-    return steps, np.asarray((total**2).sum(axis=1))
+    agree = np.zeros(len(steps))
+    for axis, another in itertools.product(range(3), repeat=2):  # one by one: they are long
+        pairs = zip(spectra, lags, strict=True)
+        found = [np.fft.irfft(own[:, axis] * other[:, another], len(at)) for (own, other), at in pairs]
+        agree += np.bincount(of, np.concatenate(found)) ** 2
+    return steps, agree
 
 
 def _shared(sensor: Stretches, robot: Stretches, offset_s: float) -> Array:
@@ -212,8 +217,8 @@ def _robot_rates(path: Path, topic: str, urdf: Path | None, link: str) -> tuple[
     """
     joints = [] if urdf is None else _chain(urdf, link)
     turning = list(dict.fromkeys(joint.follows for joint in joints if joint.axis.any()))
-    stamps, rows, left_out = list[int](), list[list[float]](), 0
-    for stamp, message in messages(path, topic):
+    stamps, rows, left_out = array("q"), array("d"), 0
+    for stamp, message in messages(path, topic, _MOST):
         if hasattr(message, "angular_velocity"):
             rate, joints = message.angular_velocity, []
             row = [rate.x, rate.y, rate.z] if message.angular_velocity_covariance[0] != -1 else []
@@ -227,27 +232,37 @@ def _robot_rates(path: Path, topic: str, urdf: Path | None, link: str) -> tuple[
             row = [at[name] for name in turning if name in at]
         if len(row) == (len(turning) if joints else 3) and np.isfinite(row).all():
             stamps.append(stamp)
-            rows.append(row)
+            rows.extend(row)
         else:
             left_out += 1
-    times = np.array(stamps, np.int64)
+    times = np.frombuffer(stamps, np.int64)
     kept = in_order(times)
     if len(times) < 2 or (~kept).mean() > MOST_LEFT_OUT:
         which = f", but for {left_out} that do not tell how the link turned," if left_out else ""
         raise RecordingError(
             f"the messages of {topic} in {path}{which} are too few, or not in the order of their stamps"
         )
-    times, values, left_out = times[kept], np.array(rows)[kept], left_out + int((~kept).sum())
+    times, values, left_out = (
+        times[kept],
+        np.array(rows).reshape(len(times), -1)[kept],
+        left_out + int((~kept).sum()),
+    )
     if not joints:
         return times, values, left_out
-    angles = dict(zip(turning, values.T, strict=True))
-    pose = np.eye(3)
+    ends = [(begin, begin + _AT_ONCE + 1) for begin in range(0, len(times) - 1, _AT_ONCE)]
+    rates = [_link_rates(joints, times[slice(*each)], turning, values[slice(*each)]) for each in ends]
+    return times[:-1] + np.diff(times) // 2, np.concatenate(rates), left_out
+
+
+def _link_rates(joints: Sequence[_Joint], times: Ints, turning: Sequence[str], values: Array) -> Array:
+    """Between the times (n,), rad/s (n - 1, 3), by the angles of the joints that turn (n, joints)."""
+    angles, pose = dict(zip(turning, values.T, strict=True)), np.eye(3)
     for joint in joints:
         angle = joint.times * angles.get(joint.follows, 0.0) + joint.plus
         pose = pose @ joint.origin @ _turned(np.outer(angle, joint.axis))
     step, passed = pose[:-1].swapaxes(1, 2) @ pose[1:], np.diff(times)
     twice = step - step.swapaxes(1, 2)  # the sine of a small angle
-    return times[:-1] + passed // 2, twice[:, (2, 0, 1), (1, 2, 0)] / (2e-9 * passed[:, np.newaxis]), left_out
+    return np.asarray(twice[:, (2, 0, 1), (1, 2, 0)] / (2e-9 * passed[:, np.newaxis]))
 
 
 class _Joint(NamedTuple):
@@ -321,12 +336,15 @@ def run(options: argparse.Namespace) -> int:
     interrupt_on_signals()
     with open_recording(options.recording, Asked.of(options)) as recording:
         rows, axis = [], TimeAxis()
-        batches = recording.batches(choose(recording, options.sensor).sensor, options.imu_units)
+        sensor = choose(recording, options.sensor)
+        step, batches = 1 + sensor.frames // _MOST, recording.batches(sensor.sensor, options.imu_units)
         for in_force, frames in axis.batches(batches):
             table = frames.where(frames.fresh & np.isfinite(frames.angular_rate).all(axis=1))
+            table = table.where(slice(None, None, step))
             delay_s = angular_rate_response(in_force.info.settings).delay_s or 0.0
             rows.append((table.monotonic_ns - round(delay_s * 1e9), table.angular_rate))
     instants, rates = map(np.concatenate, zip(*rows, strict=True))
+    rows.clear()  # as much again
     for remark in axis.said:
         say(PROGRAM, f"{options.recording}: {remark}")
     stamps, robot_rates, left_out = _robot_rates(options.bag, options.topic, options.urdf, options.link)

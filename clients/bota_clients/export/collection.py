@@ -21,7 +21,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from bota_clients.errors import RecordingError
+from bota_clients.errors import NothingAskedForError, RecordingError
 from bota_clients.export.cli import PROGRAM
 from bota_clients.export.dataset import about, arrow_of, in_chunks, parquet_writer, windows_for
 from bota_clients.export.samples import MOST_LOST, in_part, samples_of
@@ -121,6 +121,10 @@ def add(path: Path, options: argparse.Namespace, unfinished: str) -> Done:
                 Path(beside, str(number)).replace(folder / each)
             for each in {*there} - {folder / new for new in made}:
                 each.unlink()
+    except NothingAskedForError as error:
+        for each in there:
+            each.unlink()
+        return Done(0, why=str(error))
     except (RecordingError, ProtocolError) as error:
         return Done(0, why=str(error))
     except OSError as error:

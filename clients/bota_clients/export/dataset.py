@@ -326,10 +326,10 @@ def _nanoseconds(value: Any) -> int | str:
     return round(Decimal(str(value)) * _SECOND)  # the number as it was written
 
 
-def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
+def messages(path: Path, topic: str, most: int | None = None) -> Iterator[tuple[int, Any]]:
     """`header.stamp`, ns since 1970, and message, of a topic of a ROS bag (folder, .mcap, .db3, .bag).
 
-    RecordingError.
+    Where they are more than `most`, only each second, third, ... RecordingError.
     """
     from rosbags.highlevel import AnyReader, AnyReaderError  # noqa: PLC0415 - of the extra `dataset`
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
@@ -344,7 +344,8 @@ def messages(path: Path, topic: str) -> Iterator[tuple[int, Any]]:
                 there = ", ".join(sorted({each.topic for each in bag.connections}))
                 raise RecordingError(f"{path} has no topic {topic}, but {there}")
             _refuse_two_definitions(path, chosen[0], bag.connections)
-            for connection, _, data in bag.messages(chosen):
+            step = 1 + sum(each.msgcount for each in chosen) // most if most else 1
+            for connection, _, data in itertools.islice(bag.messages(chosen), None, None, step):
                 message: Any = bag.deserialize(data, connection.msgtype)
                 stamp = message.header.stamp
                 yield int(stamp.sec) * _SECOND + int(stamp.nanosec), message

@@ -10,10 +10,9 @@ from __future__ import annotations
 import argparse
 import struct
 from collections.abc import Sequence
-from typing import IO, Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from bota_clients.export.cli import PROGRAM
@@ -22,14 +21,13 @@ from bota_clients.export.samples import MOST_LOST, in_part, samples_of
 from bota_clients.export.windows import Arrays
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
+from bota_clients.recording.mcap_writer import McapWriter, message_rows, whole_file
 from bota_clients.recording.order import TimeAxis
 from bota_clients.recording.reader import Recording
-from bota_clients.recording.writer import whole_file
 from bota_ethercat.program.version import VERSION
 
 _STORE: Final[Any] = get_typestore(Stores.ROS2_JAZZY)
-_STAMP: Final = struct.Struct("<iI")  # behind the 4 bytes that say CDR, little-endian
-_NUMBER: Final = struct.Struct("<d")
+_STAMP: Final = slice(4, 12)  # s and ns, behind the bytes that say CDR, little-endian
 
 
 def _named(prefix: str, unit: str) -> list[str]:
@@ -46,22 +44,14 @@ class Topic(NamedTuple):
     columns: Sequence[str]
     valid: str = ""  # a column that says whether the others may be used
 
-    def message(self) -> bytearray:
-        """With the numbers of none."""
-        types = _STORE.types
-        time = types["builtin_interfaces/msg/Time"](0, 0)
-        header = types["std_msgs/msg/Header"](time, self.frame)
-        x_y_z, nothing = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0), np.zeros(9)
-        made = types[self.kind]
-        if self.kind.endswith("WrenchStamped"):
-            made = made(header, types["geometry_msgs/msg/Wrench"](x_y_z, x_y_z))
-        elif self.kind.endswith("Imu"):
-            no_orientation = np.array([-1.0, *[0.0] * 8])
-            turned = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 0.0)
-            made = made(header, turned, no_orientation, x_y_z, nothing, x_y_z, nothing)
-        else:
-            made = made(header, 0.0, 0.0)
-        return bytearray(_STORE.serialize_cdr(made, self.kind))
+    def message(self) -> bytes:
+        """In CDR, little-endian, with a stamp and numbers of 0."""
+        text = self.frame.encode() + b"\0"
+        head = bytes(8) + struct.pack("<I", len(text)) + text
+        numbers = np.zeros(_NUMBERS.get(self.kind, 2))
+        if self.kind == _IMU:
+            numbers[4] = -1.0  # the covariance of an orientation that there is not
+        return b"\0\1\0\0" + head + bytes(-len(head) % 8) + numbers.tobytes()
 
 
 _WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
@@ -86,15 +76,13 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     sensor, axis = choose(recording, options.sensor), TimeAxis()
     windows = windows_for(options, recording, sensor, MOST_LOST)
     with whole_file(options.output, force=options.force) as disk:
-        writer: Any = Writer(cast("IO[Any]", disk), compression=CompressionType.ZSTD)
-        writer.start("ros2", f"{PROGRAM} {VERSION}")
+        writer = McapWriter(disk, "ros2", f"{PROGRAM} {VERSION}")
         wanted = [topic for topic in TOPICS if windows.stream or not topic.valid]
         senders, sent = [_Sender(writer, topic) for topic in wanted], 0
         for block in in_part(recording, windows, samples_of(recording, windows, sensor.sensor, axis)):
             sent += sum(each.send(block) for each in senders)
             disk.flush()
         writer.finish()
-        disk.flush()
         disk.sync()
     return "; ".join([f"{count(sent, 'message')} on {', '.join(topic.name for topic in wanted)}", *axis.said])
 
@@ -102,26 +90,24 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
 class _Sender:
     """Writes one topic."""
 
-    def __init__(self, writer: Writer, topic: Topic) -> None:
+    def __init__(self, writer: McapWriter, topic: Topic) -> None:
         definition = _STORE.generate_msgdef(topic.kind, ros_version=2)[0]
-        schema = writer.register_schema(topic.kind, "ros2msg", definition.encode())
-        self._writer, self._topic, self._sequence = writer, topic, 0
-        self._channel = writer.register_channel(f"/{topic.name}", "cdr", schema)
-        self._message = topic.message()
+        self._writer, self._topic, self._sent = writer, topic, 0
+        self._channel = writer.channel(f"/{topic.name}", topic.kind, definition)
+        self._message = np.frombuffer(topic.message(), np.uint8)
         self._begin = len(self._message) - 8 * _NUMBERS.get(topic.kind, 2)
 
     def send(self, block: Arrays) -> int:
         """The samples of these rows of which all numbers are known; how many."""
-        topic, message, begin = self._topic, self._message, self._begin
+        topic = self._topic
         values = np.column_stack([block[name] for name in topic.columns]).astype(np.float64)
         known = np.isfinite(values).all(axis=1)
         if topic.valid:
             known &= block[topic.valid]
-        stamps = block["stamp_utc"][known].astype(np.int64).tolist()
-        for stamp_ns, row in zip(stamps, values[known].tolist(), strict=True):
-            _STAMP.pack_into(message, 4, *divmod(stamp_ns, 10**9))
-            for place, value in zip(topic.places, row, strict=True):
-                _NUMBER.pack_into(message, begin + 8 * place, value)
-            self._writer.add_message(self._channel, stamp_ns, bytes(message), stamp_ns, self._sequence)
-            self._sequence += 1
+        stamps = block["stamp_utc"][known].astype(np.int64)
+        bodies = np.tile(self._message, (len(stamps), 1))
+        bodies[:, _STAMP].view("<i4")[:] = np.column_stack(np.divmod(stamps, 10**9))
+        bodies[:, self._begin :].view("<f8")[:, topic.places] = values[known]
+        self._writer.messages(message_rows(self._channel, stamps, bodies, self._sent))
+        self._sent += len(stamps)
         return len(stamps)

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from bota_clients.errors import RecordingError
+from bota_clients.errors import NothingAskedForError, RecordingError
 from bota_clients.export.csv_table import VECTORS, NewSamples
 from bota_clients.export.windows import Array, Arrays, Windows, interpolated
 from bota_clients.recording.columns import RECORD, REGISTERS, Columns, joined
@@ -66,7 +66,7 @@ def in_part(recording: Recording, windows: Windows, blocks: Iterator[Arrays]) ->
         if held.any():
             yield block if held.all() else {name: array[held] for name, array in block.items()}
     if not rows:
-        raise RecordingError(f"{recording.path} has nothing to export {recording.asked.part}")
+        raise NothingAskedForError(f"{recording.path} has nothing to export {recording.asked.part}")
 
 
 def _rows(slots: Array, samples: Columns, index: Array, first_ns: int, *, tool: bool) -> Arrays:

@@ -7,17 +7,15 @@ killed does not write.
 from __future__ import annotations
 
 import argparse
-from typing import Final
 
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import PROGRAM
 from bota_clients.numbers import count
 from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
+from bota_clients.recording.mcap_writer import whole_file
 from bota_clients.recording.reader import Recording
-from bota_clients.recording.writer import RecordingWriter, whole_file
+from bota_clients.recording.writer import RecordingWriter
 from bota_ethercat.program.version import VERSION
-
-_CHUNK: Final = 1024  # messages
 
 
 def write(options: argparse.Namespace, recording: Recording) -> str:
@@ -34,14 +32,13 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
         notes["repaired"] = recording.cut_off
     with whole_file(options.output, force=options.force) as disk:
         writer = RecordingWriter(disk, f"{PROGRAM} {VERSION}", notes)
-        for number, item in enumerate(recording.everything(sensor)):
+        for item in recording.tables(sensor):
             if isinstance(item, RecordedDescription):
                 writer.describe(item.stamp_ns, item.reply)
             elif isinstance(item, RecordedEvent):
                 writer.event(item.stamp_ns, item.event)
             else:
-                writer.frame(item)
-            if number % _CHUNK == _CHUNK - 1:
-                writer.flush()
+                writer.table(item)
+            disk.flush()
         writer.finish(recording.end)
     return count(writer.frames, "frame")

@@ -24,7 +24,8 @@ from rich.filesize import decimal
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
 from bota_clients.recording.file_format import RECORDER, RecordedDescription, RecordedEvent
-from bota_clients.recording.writer import DiskFile, RecordingWriter
+from bota_clients.recording.mcap_writer import DiskFile
+from bota_clients.recording.writer import RecordingWriter
 from bota_ethercat.accounting import StreamAccounting, StreamCounts
 from bota_ethercat.address import Address
 from bota_ethercat.client import Client, Connected, Disconnected

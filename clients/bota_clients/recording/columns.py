@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bota_clients.recording import file_format
-from bota_clients.recording.mcap_file import HEAD, RECORD_HEAD, Rows
+from bota_clients.recording.mcap_file import HEAD, HEADS, RECORD_HEAD, Rows
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.framing import DataMessage
 from bota_ethercat.pdo import LAYOUTS, STANDARD_GRAVITY, ImuUnits
@@ -50,11 +50,7 @@ def _fields(size: int) -> list[tuple[str, str, tuple[int, ...]]]:
 
 def _record(size: int) -> np.dtype[np.void]:
     """A frame with this much process data as a message in a chunk: heads, frame and fields."""
-    heads = [
-        ("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("number", "<u4"), ("logged", "<u8"),
-        ("published", "<u8"), ("cdr", "<u4"),
-    ]  # fmt: skip
-    return np.dtype([*heads, *_FRAME, ("size", "<u4"), *_fields(size)])
+    return np.dtype([*HEADS, ("cdr", "<u4"), *_FRAME, ("size", "<u4"), *_fields(size)])
 
 
 RECORDS: Final = {size: _record(size) for size in sorted(LAYOUTS)}

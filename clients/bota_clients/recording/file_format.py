@@ -18,8 +18,6 @@ from bota_ethercat.text.json_text import JsonObject, encode_json_text, parse_jso
 
 FORMAT_VERSION: Final = "1"
 PROFILE: Final = "ros2"
-ENCODING: Final = "cdr"
-SCHEMA_ENCODING: Final = "ros2msg"
 
 # Names of metadata records: at the start, and at the end of a complete recording.
 METADATA: Final = "bota_ethercat"

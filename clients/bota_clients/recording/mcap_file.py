@@ -44,22 +44,27 @@ MAX_METADATA: Final = 1024 * 1024  # bytes
 MAX_CHANNELS: Final = 4096
 _BARE: Final = 1024 * 1024  # bytes of messages outside of chunks that are taken for one
 
-_RECORD: Final = struct.Struct("<BQ")
+RECORD: Final = struct.Struct("<BQ")
 _CHUNK: Final = struct.Struct("<QQQII")  # times, size and CRC without compression, length of its name
 _U64: Final = struct.Struct("<Q")
-_MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _LOOK_AHEAD: Final = 512  # records
 _SHORT: Final = 256  # bytes: longer ones than a frame
-_INDEX: Final = struct.Struct("<HI")  # channel, bytes that follow: 16 for each message
+INDEX: Final = struct.Struct("<HI")  # channel, bytes that follow: 16 for each message
 # With the trailing magic: the last bytes of a complete file.
 _FOOTER_SIZE: Final = struct.calcsize("<BQQQI8s")
 _UNREADABLE: Final = (McapError, zstandard.ZstdError, struct.error, ValueError, OverflowError, RuntimeError)
 
 _Counts = tuple[tuple[int, int], ...]
 Rows = npt.NDArray[np.uint8]  # (n, bytes of each)
-RECORD_HEAD: Final = _RECORD.size
-HEAD: Final = RECORD_HEAD + _MESSAGE.size  # bytes before the body of a message
+RECORD_HEAD: Final = RECORD.size
+HEAD: Final = RECORD_HEAD + MESSAGE.size  # bytes before the body of a message
 CHANNEL: Final = slice(RECORD_HEAD, RECORD_HEAD + 2)  # where a message has its channel
+# The fields before the body.
+HEADS: Final = (
+    ("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("number", "<u4"), ("logged", "<u8"),
+    ("published", "<u8"),
+)  # fmt: skip
 
 _Record = TypeVar("_Record", Channel, Metadata)
 
@@ -91,9 +96,9 @@ def _padded(data: memoryview, records: list[tuple[int, int]]) -> Rows:
 def message_in(row: Rows) -> tuple[int, int, memoryview]:
     """Channel, log time (ns) and body of a message in its record."""
     data = memoryview(row.tobytes())
-    _, length = _RECORD.unpack_from(data)
-    channel, _, log_time_ns, _ = _MESSAGE.unpack_from(data, _RECORD.size)
-    return channel, log_time_ns, data[HEAD : _RECORD.size + length]
+    _, length = RECORD.unpack_from(data)
+    channel, _, log_time_ns, _ = MESSAGE.unpack_from(data, RECORD.size)
+    return channel, log_time_ns, data[HEAD : RECORD.size + length]
 
 
 class McapFile:
@@ -174,9 +179,9 @@ class McapFile:
         The summary that follows repeats what was read.
         """
         position = len(MAGIC)
-        while len(head := self._read_at(position, _RECORD.size)) == _RECORD.size and head[0]:
-            opcode, length = _RECORD.unpack(head)
-            body = position + _RECORD.size
+        while len(head := self._read_at(position, RECORD.size)) == RECORD.size and head[0]:
+            opcode, length = RECORD.unpack(head)
+            body = position + RECORD.size
             if opcode == Opcode.DATA_END or body + length > self._size:
                 return position, opcode == Opcode.DATA_END
             if (opcode == Opcode.HEADER) != (position == len(MAGIC)):
@@ -208,14 +213,14 @@ class McapFile:
         elif opcode == Opcode.CHUNK:
             self._add(body)
         elif opcode == Opcode.MESSAGE_INDEX:
-            head = self._read_at(body, min(length, _INDEX.size))
-            channel, size = _INDEX.unpack(head) if len(head) == _INDEX.size else (0, -1)
-            if not self._chunks or not 0 <= size <= length - _INDEX.size or size % 16:
+            head = self._read_at(body, min(length, INDEX.size))
+            channel, size = INDEX.unpack(head) if len(head) == INDEX.size else (0, -1)
+            if not self._chunks or not 0 <= size <= length - INDEX.size or size % 16:
                 raise self._damaged(body, "a message index is malformed or belongs to no chunk")
             counts = *self._counts[-1], (channel, size // 16)
             self._counts[-1] = self._known.setdefault(counts, counts)
         elif opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
-            begin, size = body - _RECORD.size, _RECORD.size + length
+            begin, size = body - RECORD.size, RECORD.size + length
             last = self._bare.get(self._chunks[-1], 0) if self._chunks else 0
             if last and self._chunks[-1] + last == begin and last + size <= _BARE:
                 self._bare[self._chunks[-1]] = last + size
@@ -237,7 +242,7 @@ class McapFile:
                 numbers, counts = np.unique(rows[:, CHANNEL].copy().view("<u2"), return_counts=True)
                 found.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
             elif opcode == Opcode.CHANNEL:
-                made = self._parse(Channel, memoryview(rows[0])[_RECORD.size :], chunk)
+                made = self._parse(Channel, memoryview(rows[0])[RECORD.size :], chunk)
                 self.topics[made.id] = made.topic
                 if len(self.topics) > MAX_CHANNELS:
                     raise self._damaged(chunk, f"it has more than {MAX_CHANNELS} channels")
@@ -251,11 +256,11 @@ class McapFile:
         position, size = 0, len(data)
         short = list[tuple[int, int]]()  # begin and end
         while position < size:
-            if position + _RECORD.size > size:
+            if position + RECORD.size > size:
                 raise self._damaged(chunk, "a record in a chunk is incomplete")
-            opcode, length = _RECORD.unpack_from(data, position)
-            stride = _RECORD.size + length
-            if stride > size - position or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
+            opcode, length = RECORD.unpack_from(data, position)
+            stride = RECORD.size + length
+            if stride > size - position or (opcode == Opcode.MESSAGE and length < MESSAGE.size):
                 raise self._damaged(chunk, f"a record in a chunk claims {length} bytes")
             count = _alike(data, position, stride) if opcode == Opcode.MESSAGE else 1
             end = position + count * stride

@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bota_clients.errors import RecordingError
+from bota_clients.errors import NothingAskedForError, RecordingError
 from bota_clients.numbers import moment, seconds
 from bota_clients.recording import file_format
 from bota_clients.recording.asked import Asked
@@ -179,7 +179,7 @@ class Recording(McapFile):
             stamps = [stamp for each in ends for stamp in each.tolist()] or [0]  # and not all tables
             begin_ns, end_ns = stamps[0], stamps[-1]
             long = f"it is {seconds((end_ns - begin_ns) * 1e-9)} long, from {moment(begin_ns)} on"
-            raise RecordingError(f"{self.path} has nothing {self.asked.part}: {long}")
+            raise NothingAskedForError(f"{self.path} has nothing {self.asked.part}: {long}")
 
     def _in_part(self, sensor: RecordedSensor) -> RecordedSensor:
         """With its frames, and what was in force for them."""
