@@ -130,8 +130,10 @@ def stationary_means(rows: Array, limits: StationaryLimits) -> StationaryMeans:
     of_force, of_torque, of_acceleration = (triple(spread[first : first + 3]) for first in (0, 3, 6))
     latest = Wrench.of(rows[-len(rows) // _BLOCKS :, :6].mean(axis=0))
     noise = (rows[:, :6] - mean[:6]) / (spread[:6] + _NO_LIMIT)
-    pairs = [float((noise[by:] * noise[:-by]).sum()) for by in range(1, min(_ALIKE, len(rows)))]
-    alike = max(1.0, 1.0 + 2.0 * sum(pairs) / noise.size)
+    lags = range(1, min(_ALIKE, len(rows) // 4 + 1))
+    pairs = sum(float((noise[by:] * noise[:-by]).sum()) for by in lags) / noise.size
+    # Noise less its own mean lacks some of that at every lag.
+    alike = max(1.0, (1.0 + 2.0 * pairs) / (1.0 - (2.0 * len(lags) + 1.0) / len(rows)))
     return StationaryMeans(
         Wrench(f, t), a, of_force, of_torque, len(rows), of_acceleration, latest=latest, alike=alike
     )

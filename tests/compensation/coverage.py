@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import math
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -204,6 +203,8 @@ def intervals(case: Case, runs: int, first: int = 0) -> tuple[dict[str, Array], 
             "scale": (read.scale, read.scale_interval, scale),
             "crossed": (read.cross_axis, read.cross_axis_interval, crossed),
         }
+        if case.poses:
+            rows["bias"] = found.bias.values, found.bias_interval.values, BIAS.values
         if case.seconds:
             rows["tensor"] = payload.inertia, payload.inertia_interval, tool.inertia
         for name, (value, half, truth) in rows.items():
@@ -331,17 +332,14 @@ def alarms(kind: str, name: str, case: Case, minutes: int, first: int = 0) -> in
 def contacts(stream: CompensatedStream, felt: Felt) -> int:
     """How often contact begins, after a second."""
     detector = stream.contact_detector(Plane((0.0, 0.0, 0.1), (0.0, 0.0, 1.0), 0.05))
-    source, rows = stream.plan.source, []
+    source = stream.plan.source
     assert isinstance(source, ImuSource)
     source.configure(stream.in_force)
-    for time_s, _, _, read, rate in zip(*(part.tolist() for part in felt), strict=True):
-        at = source.follow(read, rate, time_s)
-        rows.append((at or (math.nan,) * 3, *source.turning))
-    at, *turning = cast(Any, np.moveaxis(np.array(rows), 0, 2))
+    at, turning = source.follow_all(felt.acceleration, felt.rate, felt.times)
     columns = SimpleNamespace(force=felt.force.T, torque=felt.torque.T)
-    final, is_beyond = stream.stages(columns, 0.0, at, turning).final, []
+    final, is_beyond = stream.stages(columns, 0.0, cast(Any, at), cast(Any, turning)).final, []
     for detector.is_contact in (False, True):  # of the limits of the beginning and of the end
-        is_beyond.append(cast(Any, detector.update(*final, turning)))
+        is_beyond.append(cast(Any, detector.update(*final, cast(Any, turning))))
     begins, lasts = is_beyond
     return len(np.unique(np.cumsum(~lasts)[begins & (felt.times > 1.0)]))
 

@@ -7,6 +7,7 @@ import functools
 import numpy as np
 import pytest
 
+from bota_ethercat.sensor.response import imu_noise
 from tests.compensation import coverage, motion
 from tests.compensation.coverage import CASES, KINDS, MOTIONS, Case, bounds, intervals, judged
 from tests.compensation.making import SEED
@@ -43,6 +44,13 @@ def test_intervals_cover_95_percent(name: str, runs: int) -> None:
             held = np.mean(np.abs(found) <= 1.0)
             assert held > 0.91 - chance(0.91, runs), (name, what)
             assert runs < 200 or 1.96 * np.sqrt(np.mean(found**2)) > 0.5, (name, what)
+
+
+def test_noise_of_the_accelerometer_along_gravity_does_not_widen_the_interval_of_the_mass() -> None:
+    seed, case = 1000 * SEED, Case(seconds=0.0, sinc_length=512)  # quiet force, 100 samples a pose
+    found = coverage.identified(case, motion.tool_of(seed), coverage.imu_of(seed, case), seed)
+    by_noise = 1.5 / 9.81 * imu_noise(case.settings)[0] / np.sqrt(6 * 100)  # kg
+    assert found.mass_interval < 0.7 * 1.96 * by_noise
 
 
 @pytest.mark.timeout(3600)

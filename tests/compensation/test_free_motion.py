@@ -24,8 +24,9 @@ from bota_ft_compensation.identification.free_motion import (
     _together,
     identify_in_motion,
 )
-from bota_ft_compensation.identification.inertia import Turned, crossing, turn
+from bota_ft_compensation.identification.inertia import Turned, turn
 from bota_ft_compensation.identification.payload import Identified, Joint
+from bota_ft_compensation.identification.weighted import crossing
 from bota_ft_compensation.quantities import EXACT, CompensationError, Payload, likely_inertia
 from tests.compensation import motion
 from tests.compensation.making import BIAS, SEED, check_coverage

@@ -27,7 +27,6 @@ from bota_ft_compensation.identification.estimation import (
 from bota_ft_compensation.identification.inertia import (
     PLACES,
     Turned,
-    crossing,
     divided,
     possible_inertia,
     solve_pieces,
@@ -45,7 +44,7 @@ from bota_ft_compensation.identification.payload import (
     too_vague,
 )
 from bota_ft_compensation.identification.poses import Coverage
-from bota_ft_compensation.identification.weighted import Array, students_t
+from bota_ft_compensation.identification.weighted import Array, crossing, students_t
 from bota_ft_compensation.quantities import (
     NO_WRENCH,
     NORMAL_95,

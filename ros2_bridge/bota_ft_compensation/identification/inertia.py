@@ -29,6 +29,7 @@ from bota_ft_compensation.identification.resampling import (
     smoothed,
     stretches,
 )
+from bota_ft_compensation.identification.weighted import crossing
 from bota_ft_compensation.quantities import (
     ELEMENTS,
     Accelerometer,
@@ -213,14 +214,6 @@ def possible_inertia(found: Array, interval: Array) -> Array:
     spread = np.maximum(spread, 0.0)
     tensor = spread.sum() * np.eye(3) - (axes * spread) @ axes.T
     return np.array([tensor[i, j] for i, j in PLACES])
-
-
-def crossing(vectors: Array) -> Array:
-    """(n, 3, 3): times another vector, this one's cross product with it."""
-    x, y, z = vectors.T
-    nothing = np.zeros_like(x)
-    rows = ((nothing, -z, y), (z, nothing, -x), (-y, x, nothing))
-    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def _elements(vectors: Array) -> Array:
