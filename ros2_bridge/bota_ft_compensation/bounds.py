@@ -122,7 +122,7 @@ class Bounds:
 
         Components may be arrays of samples.
         """
-        (x, y, z), ((wx, wy, wz), (ax, ay, az)) = felt, turning
+        (x, y, z), ((wx, wy, wz), (ax, ay, az), *_) = felt, turning
         if self._from is None:  # unknown: on average
             x = y = z = STANDARD_GRAVITY * math.sqrt(2.0 / 3.0)
         else:

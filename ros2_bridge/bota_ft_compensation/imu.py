@@ -117,7 +117,7 @@ class ImuSource(Source):
         return found
 
     def follow_all(self, acceleration: Array, angular_rate: Array, times: Array) -> tuple[Array, Array]:
-        """As `follow`, of samples (n, 3) at `times` (n,): (3, n), NaN for None, and `turning` (2, 3, n)."""
+        """As `follow`, of samples (n, 3) at `times` (n,): as `ImuSpecificForce.follow_all`."""
         felt, turned = self._imu.follow_all(np.hstack([acceleration, angular_rate]), times)
         self.turning = self._imu.turning
         felt[:, ~acceleration.any(axis=1)] = math.nan

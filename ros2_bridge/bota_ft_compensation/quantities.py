@@ -22,7 +22,9 @@ class CompensationError(Exception):
     """Something cannot be estimated or identified; the text is one sentence for people."""
 
 
-Turning = tuple[Vector3, Vector3]  # angular rate, rad/s, and angular acceleration, rad/s²
+# Angular rate, rad/s, and angular acceleration, rad/s²; behind a filter that passes products of rates
+# otherwise also these, (rad/s)²: xx yy zz, and xy xz yz.
+Turning = tuple[Vector3, ...]
 STILL: Final[Turning] = (ZERO, ZERO)
 UPRIGHT: Final[Vector3] = (0.0, 0.0, STANDARD_GRAVITY)  # specific force at rest
 
@@ -137,6 +139,12 @@ def likely_inertia(payload: Payload) -> tuple[Six, Six]:
     largest = payload.mass * (_REACH**2 + length(payload.center) ** 2)
     moment, half = _LIKELY * largest, _ABOUT * largest
     return (moment, moment, moment, 0.0, 0.0, 0.0), (half, half, half, *(_LIKELY * largest,) * 3)
+
+
+def products(rate: Vector3) -> tuple[Vector3, Vector3]:
+    """As `Turning` has them."""
+    x, y, z = rate
+    return (x * x, y * y, z * z), (x * y, x * z, y * z)
 
 
 def length(a: Vector3) -> float:

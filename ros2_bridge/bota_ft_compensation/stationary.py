@@ -53,6 +53,13 @@ class StationaryMeans(NamedTuple):
     # Variance of means of force and torque, against that of as many samples that filters do not make alike.
     alike: float = 1.0
 
+    @property
+    def noise(self) -> tuple[float, ...]:
+        """Deviations of force, N, and torque, Nm, of a sample from which the mean is subtracted."""
+        share = min(self.alike / self.samples, 0.5)  # of the variance: of the mean, and missing in the window
+        wider = math.sqrt((1.0 + share) / (1.0 - share))
+        return tuple(wider * each for each in self.force_spread + self.torque_spread)
+
 
 class StationaryWindow:
     """Collects the samples of one window. `add` until it is true, then `means`."""

@@ -290,7 +290,7 @@ def tare(stream: CompensatedStream, rows: Array) -> None:
     plan, means = stream.plan, stationary_means(rows, _ROOM)
     x, y, z = plan.accelerometer.correct(means.acceleration)
     bias = estimate_bias(means, plan.payload, (x, y, z))
-    noise = at_reference(means.force_spread + means.torque_spread, stream.in_force.info.settings)
+    noise = at_reference(means.noise, stream.in_force.info.settings)
     taken = TareBasis(plan.payload, (x, y, z), plan.accelerometer, noise)
     stream.plan = plan._replace(ramp=plan.ramp.go(bias, 0.0, taken=taken))
 

@@ -26,8 +26,8 @@ from bota_ft_compensation.identification.free_motion import (
 )
 from bota_ft_compensation.identification.inertia import Turned, turn
 from bota_ft_compensation.identification.payload import Identified, Joint
-from bota_ft_compensation.identification.weighted import crossing
 from bota_ft_compensation.quantities import EXACT, CompensationError, Payload, likely_inertia
+from bota_ft_compensation.turning import crossing
 from tests.compensation import motion
 from tests.compensation.making import BIAS, SEED, check_coverage
 from tests.compensation.motion import IMU, Array, Felt, imperfect, settings, tensor, tool_of

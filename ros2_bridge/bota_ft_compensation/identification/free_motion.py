@@ -25,7 +25,6 @@ from bota_ft_compensation.identification.estimation import (
     corrected,
 )
 from bota_ft_compensation.identification.inertia import (
-    PLACES,
     Turned,
     divided,
     possible_inertia,
@@ -44,7 +43,7 @@ from bota_ft_compensation.identification.payload import (
     too_vague,
 )
 from bota_ft_compensation.identification.poses import Coverage
-from bota_ft_compensation.identification.weighted import Array, crossing, students_t
+from bota_ft_compensation.identification.weighted import Array, students_t
 from bota_ft_compensation.quantities import (
     NO_WRENCH,
     NORMAL_95,
@@ -57,6 +56,7 @@ from bota_ft_compensation.quantities import (
     likely_inertia,
 )
 from bota_ft_compensation.stationary import triple
+from bota_ft_compensation.turning import PLACES, crossing, turning
 
 _ROUNDS: Final = 8
 _LIGHTEST: Final = 1e-3  # kg
@@ -99,10 +99,6 @@ def _imu_covariance() -> Array:
 
 
 _IMU: Final = np.linalg.inv(_imu_covariance())
-_TENSORS: Final = np.zeros((6, 3, 3))  # of each element
-for _number, (_row, _column) in enumerate(PLACES):
-    _TENSORS[_number, _row, _column] = _TENSORS[_number, _column, _row] = 1.0
-_LEVI_CIVITA: Final = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
 
 
 class _Model:
@@ -133,7 +129,7 @@ class _Model:
         right = np.eye(3) - unknowns[_GYROSCOPE].reshape(3, 3)
         spin, products = self._spin @ right.T, right @ self._products @ right.T
         place = self._imu + unknowns[_PLACE]
-        arm, spun = _turning(spin, products)
+        arm, spun = turning(spin, products)
         felt, by_read = corrected(self._read, unknowns[_READ])
         felt = felt - (arm @ place)
         by_place = np.zeros((len(felt), 6, 3))
@@ -143,7 +139,7 @@ class _Model:
             less = np.zeros((3, 3))
             less[row, column] = -1.0
             of_products = less @ self._products @ right.T
-            change, spun_change = _turning(self._spin @ less.T, of_products + of_products.transpose(0, 2, 1))
+            change, spun_change = turning(self._spin @ less.T, of_products + of_products.transpose(0, 2, 1))
             moved = -change @ place
             by_gyroscope[:, :3, number] = -mass * moved - change @ moment
             by_gyroscope[:, 3:, number] = np.cross(moved, moment) - spun_change @ tensor
@@ -156,14 +152,6 @@ class _Model:
         of_tensor = np.concatenate([nothing, -spun], axis=1)
         rows = [of_mass, of_moment, of_tensor, self._bias, of_imu, np.zeros((len(felt), 6, 6))]
         return np.concatenate(rows, axis=2), of_imu @ unknowns[_OF_IMU]
-
-
-def _turning(spin: Array, products: Array) -> tuple[Array, Array]:
-    """As `Turned`: arm and spun, by angular acceleration (n, 3) and products of angular rates (n, 3, 3)."""
-    trace = np.trace(products, axis1=1, axis2=2)[:, None, None]
-    spun = np.einsum("eij,nj->nie", _TENSORS, spin)
-    spun = spun + np.einsum("ijk,njl,elk->nie", _LEVI_CIVITA, products, _TENSORS, optimize=True)
-    return crossing(spin) + products - trace * np.eye(3), spun
 
 
 class _Answer(NamedTuple):
@@ -280,7 +268,7 @@ def _left(found: _Answer, imu: Vector3, bias: slice) -> Six:
     axes = np.eye(3)
     felt = np.concatenate([STANDARD_GRAVITY * axes, -STANDARD_GRAVITY * axes, np.zeros((4, 3))])
     spin = np.concatenate([np.zeros((6, 3)), _SPUN * axes, np.zeros((1, 3))])
-    arm, spun = _turning(spin, np.zeros((10, 3, 3)))
+    arm, spun = turning(spin, np.zeros((10, 3, 3)))
     felt -= arm @ (found.unknowns[_MOMENT] / found.unknowns[0])
     nothing = np.zeros((10, 3))
     model = _Model(Turned(nothing, nothing, felt, arm, spun, np.arange(10.0)), imu)

@@ -29,12 +29,8 @@ from bota_ft_compensation.identification.resampling import (
     smoothed,
     stretches,
 )
-from bota_ft_compensation.identification.weighted import crossing
-from bota_ft_compensation.quantities import (
-    ELEMENTS,
-    Accelerometer,
-    CompensationError,
-)
+from bota_ft_compensation.quantities import Accelerometer, CompensationError
+from bota_ft_compensation.turning import PLACES, TENSORS, turning
 
 _RESPONSES: Final = acceleration_response, angular_rate_response
 _WINDOW_S: Final = 0.05  # of the smoothing; a quarter of it apart are the instants that are compared
@@ -47,7 +43,6 @@ _LEAST_SPIN: Final = 0.3
 _GRAVITY, _GAIN, _CHANCE = (7.0, 13.0), 0.35, 4.0
 _CHANGES: Final = 1.0  # m/s³, rms: with less an offset of the gyroscope would be most of the turning
 _AT_FIRST: Final = 1e6  # weights: what is measured goes first, not what was known before
-PLACES: Final = [("xyz".index(row), "xyz".index(column)) for row, column in ELEMENTS]
 
 
 class Turned(NamedTuple):
@@ -90,16 +85,18 @@ def turn(
         load, acceleration, rate = np.split(samples[stretch], [6, 9], axis=1)
         load = at_times(times, own, load)
         acceleration, rate = (
-            smoothed(at_times(times - lag_s + delay_s - late[0], own, columns), taps, "full")[: len(times)]
+            at_times(times - lag_s + delay_s - late[0], own, columns)
             for columns, delay_s in zip((acceleration, rate), late, strict=True)
         )
+        # Products of rates pass the FIR filter otherwise than as products of what passes.
+        read = np.hstack([acceleration, rate, (rate[:, :, None] * rate[:, None]).reshape(-1, 9)])
+        passed = smoothed(read, taps, "full")[: len(times)]
+        acceleration, rate, products = np.split(passed, [3, 6], axis=1)
         felt = np.stack(accelerometer.correct(tuple(acceleration.T)), axis=1)
-        spin = np.gradient(rate, period, axis=0)
-        arm = crossing(spin) + crossing(rate) @ crossing(rate)
+        arm, spun = turning(np.gradient(rate, period, axis=0), products.reshape(-1, 3, 3))
         moved.append((felt, rate, arm))
-        spun = _elements(spin) + crossing(rate) @ _elements(rate)
         columns = [load, felt - arm @ np.array(imu), arm.reshape(-1, 9), spun.reshape(-1, 18)]
-        smooth, times = smoothed(np.concatenate(columns, axis=1), window)[::every], times[::every]
+        smooth, times = smoothed(np.hstack(columns), window)[::every], times[::every]
         is_whole = (times > begin_s + reach_s) & (times < end_s - _WINDOW_S)
         found.append(smooth[is_whole])
         instants.append(times[is_whole])
@@ -201,9 +198,7 @@ def possible_inertia(found: Array, interval: Array) -> Array:
     Half its trace less itself is the second moment of the mass, which is nowhere negative: this is that the
     moments are positive, and none larger than the sum of the others.
     """
-    tensor = np.zeros((3, 3))
-    for (i, j), value in zip(PLACES, found, strict=True):
-        tensor[i, j] = tensor[j, i] = value
+    tensor = np.tensordot(found, TENSORS, 1)
     spread, axes = np.linalg.eigh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
     if spread[0] < -np.linalg.norm(interval):
         moments = ", ".join(f"{moment:.2g}" for moment in np.linalg.eigvalsh(tensor))
@@ -214,12 +209,3 @@ def possible_inertia(found: Array, interval: Array) -> Array:
     spread = np.maximum(spread, 0.0)
     tensor = spread.sum() * np.eye(3) - (axes * spread) @ axes.T
     return np.array([tensor[i, j] for i, j in PLACES])
-
-
-def _elements(vectors: Array) -> Array:
-    """(n, 3, 6): times the elements of a symmetric tensor, that tensor times the vector."""
-    found = np.zeros((len(vectors), 3, 6))
-    for element, (i, j) in enumerate(PLACES):
-        found[:, i, element] = vectors[:, j]
-        found[:, j, element] = vectors[:, i]
-    return found

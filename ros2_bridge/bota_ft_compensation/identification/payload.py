@@ -27,7 +27,7 @@ from bota_ft_compensation.identification.estimation import (
     estimate,
 )
 from bota_ft_compensation.identification.poses import MOST_POSES, Coverage, Pose, coverage
-from bota_ft_compensation.identification.weighted import CONFIDENCE, Array, crossing
+from bota_ft_compensation.identification.weighted import CONFIDENCE, Array
 from bota_ft_compensation.quantities import (
     IDENTITY,
     NORMAL_95,
@@ -45,6 +45,7 @@ from bota_ft_compensation.quantities import (
     likely_inertia,
 )
 from bota_ft_compensation.stationary import triple
+from bota_ft_compensation.turning import crossing
 
 LARGEST_MASS: Final = 500.0  # kg: no sensor of the family carries more
 LARGEST_CENTRE: Final = 2.0  # m
@@ -213,7 +214,7 @@ def identify(poses: Sequence[Pose]) -> Identified:
         drift,
         None if touched is None else touched.pose,
         Joint(every.unknowns, every.covariance) if every and every.calibration else None,
-        tuple(np.sqrt((equations.spread**2).mean(axis=0)).tolist()),
+        equations.noise,
     )
     if why := too_vague(payload, mass_interval, gravity):
         raise TooVagueError(f"the poses {why}; {seen.next_pose if touched is None else touched}", result)
@@ -242,6 +243,12 @@ class _Equations:
             self.minutes = (np.array(times) - times[-1]) / _SECONDS_A_MINUTE
 
         self._is_turned, self._prior = False, FULL_CALIBRATION
+
+    @property
+    def noise(self) -> tuple[float, ...]:
+        """Deviations of single samples; the part that is the mean's lacks in a window."""
+        squares = self.spread**2 / np.maximum(1.0 - 1.0 / self._samples, 0.5)
+        return tuple(np.sqrt(squares.mean(axis=0)).tolist())
 
     def choose(self) -> str:
         """Fit as much of the accelerometer as the poses tell: what that is, for people."""

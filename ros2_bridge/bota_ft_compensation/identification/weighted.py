@@ -134,11 +134,3 @@ def _inside(angle: Array, nu: Array) -> Array:
     end = np.minimum(angle, 9.0 / np.sqrt(nu))[..., np.newaxis]
     powers = np.cos(0.5 * end * (1.0 + _NODES)) ** (nu[..., np.newaxis] - 1.0)
     return 0.5 * end[..., 0] * (powers @ _WEIGHTS)
-
-
-def crossing(vectors: Array) -> Array:
-    """(n, 3, 3): times another vector, this one's cross product with it."""
-    x, y, z = vectors.T
-    nothing = np.zeros_like(x)
-    rows = ((nothing, -z, y), (z, nothing, -x), (-y, x, nothing))
-    return np.moveaxis(np.array(rows), -1, 0)
