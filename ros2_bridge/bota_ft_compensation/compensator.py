@@ -16,7 +16,6 @@ from bota_ft_compensation.quantities import (
     Payload,
     Turning,
     Wrench,
-    products,
 )
 
 
@@ -68,8 +67,11 @@ class Compensator:
 def _inertial_torque(inertia: tuple[float, ...], turning: Turning) -> Vector3:
     """J alpha + omega x J omega, Nm: what it takes to turn a tool so."""
     xx, yy, zz, xy, xz, yz = inertia
-    rate, (ax, ay, az), *others = turning
-    (wxx, wyy, wzz), (wxy, wxz, wyz) = others or products(rate)
+    if len(turning) > 2:
+        _, (ax, ay, az), (wxx, wyy, wzz), (wxy, wxz, wyz) = turning
+    else:
+        (wx, wy, wz), (ax, ay, az) = turning
+        wxx, wyy, wzz, wxy, wxz, wyz = wx * wx, wy * wy, wz * wz, wx * wy, wx * wz, wy * wz
     return (
         xx * ax + xy * ay + xz * az + xz * wxy - xy * wxz + yz * (wyy - wzz) + (zz - yy) * wyz,
         xy * ax + yy * ay + yz * az + xy * wyz - yz * wxy + xz * (wzz - wxx) + (xx - zz) * wxz,

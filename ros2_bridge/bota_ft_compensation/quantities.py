@@ -141,12 +141,6 @@ def likely_inertia(payload: Payload) -> tuple[Six, Six]:
     return (moment, moment, moment, 0.0, 0.0, 0.0), (half, half, half, *(_LIKELY * largest,) * 3)
 
 
-def products(rate: Vector3) -> tuple[Vector3, Vector3]:
-    """As `Turning` has them."""
-    x, y, z = rate
-    return (x * x, y * y, z * z), (x * y, x * z, y * z)
-
-
 def length(a: Vector3) -> float:
     return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
 

@@ -15,7 +15,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -33,7 +33,6 @@ from bota_ft_compensation.quantities import (
     Matrix,
     Quaternion,
     Turning,
-    products,
 )
 from bota_ft_compensation.turning import PLACES, TENSORS
 
@@ -99,8 +98,7 @@ class ImuSpecificForce:
             return None
         passed_s, self._time_s = time_s - self._time_s, time_s
         if self._has_products:
-            squares, mixed = products(angular_rate)
-            row = (*row, *squares, *mixed)
+            row = (*row, *_products(*angular_rate))
         dx, dy, dz = self.lever
         lead, filled = self.alignment.lead, self._filled
         if 0.0 < passed_s <= self.alignment.gap_s:
@@ -144,8 +142,7 @@ class ImuSpecificForce:
             end = ends[begin]
             wide = rows[begin:end]
             if self._has_products:
-                squares, mixed = products(cast(Any, wide[:, 3:].T))
-                wide = np.column_stack([wide, *squares, *mixed])
+                wide = np.column_stack([wide, *_products(*wide[:, 3:].T)])
             held = np.concatenate([self._rows[self._end - size + 1 : self._end], wide])
             # Multiplied one by one: the sums of a larger product would be in another order.
             found = self.alignment.taps @ sliding_window_view(held, size, axis=0).swapaxes(1, 2)
@@ -159,16 +156,22 @@ class ImuSpecificForce:
 
     def _at_center(self, aligned: Any) -> tuple[Vector3, Turning]:
         """Specific force and turning, by readings (3, 6 or 12) of a sample, or of many."""
-        (ax, ay, az, *_), (_, _, _, wx, wy, wz, *own), (_, _, _, tx, ty, tz, *_) = aligned
-        (bx, by, bz), (dx, dy, dz), rate, spin = self._base, self.lever, (wx, wy, wz), (tx, ty, tz)
-        of_rate = ((*own[:3],), (*own[3:],)) if own else products(rate)
-        (xx, yy, zz), (xy, xz, yz) = of_rate
+        (bx, by, bz), (dx, dy, dz) = self._base, self.lever
+        if self._has_products:
+            (ax, ay, az, *_), (_, _, _, wx, wy, wz, xx, yy, zz, xy, xz, yz), (_, _, _, tx, ty, tz, *_) = (
+                aligned
+            )
+            turning: Turning = (wx, wy, wz), (tx, ty, tz), (xx, yy, zz), (xy, xz, yz)
+        else:
+            (ax, ay, az, _, _, _), (_, _, _, wx, wy, wz), (_, _, _, tx, ty, tz) = aligned
+            turning = (wx, wy, wz), (tx, ty, tz)
+            xx, yy, zz, xy, xz, yz = wx * wx, wy * wy, wz * wz, wx * wy, wx * wz, wy * wz
         felt = (
             ax + bx + ty * dz - tz * dy + xy * dy + xz * dz - (yy + zz) * dx,
             ay + by + tz * dx - tx * dz + xy * dx + yz * dz - (xx + zz) * dy,
             az + bz + tx * dy - ty * dx + xz * dx + yz * dy - (xx + yy) * dz,
         )
-        return felt, (rate, spin, *of_rate) if own else (rate, spin)
+        return felt, turning
 
     def _bridge(self, row: Row, passed_s: float) -> None:
         """The samples that were lost before one that comes so long after the one before."""
@@ -193,6 +196,10 @@ class ImuSpecificForce:
             self._end = self._size
         self._rows[self._end] = row
         self._end += 1
+
+
+def _products(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
+    return x * x, y * y, z * z, x * y, x * z, y * z
 
 
 def _turns(rate: Sequence[float]) -> bool:
