@@ -27,7 +27,7 @@ from bota_ethercat.stream.timeline import InForce
 from bota_ft_compensation.alignment import align
 from bota_ft_compensation.bias import TareBasis, estimate_bias
 from bota_ft_compensation.bounds import at_reference
-from bota_ft_compensation.contact import Plane
+from bota_ft_compensation.contact import ContactDetector, Plane
 from bota_ft_compensation.identification.free_motion import identify_in_motion
 from bota_ft_compensation.identification.inertia import turn
 from bota_ft_compensation.identification.parameter_file import stream_of, write_payload, write_yaml
@@ -337,11 +337,17 @@ def contacts(stream: CompensatedStream, felt: Felt) -> int:
     source.configure(stream.in_force)
     at, turning = source.follow_all(felt.acceleration, felt.rate, felt.times)
     columns = SimpleNamespace(force=felt.force.T, torque=felt.torque.T)
-    final, is_beyond = stream.stages(columns, 0.0, cast(Any, at), cast(Any, turning)).final, []
+    final, late = stream.stages(columns, 0.0, cast(Any, at), cast(Any, turning)).final, felt.times > 1.0
+    return begun(detector, *(part[..., late] for part in (*map(np.array, final), turning)))
+
+
+def begun(detector: ContactDetector, force: Array, torque: Array, turning: Any) -> int:
+    """How often contact begins, of samples (3, n); `turning` (2, 3, n)."""
+    is_beyond: list[Any] = []
     for detector.is_contact in (False, True):  # of the limits of the beginning and of the end
-        is_beyond.append(cast(Any, detector.update(*final, cast(Any, turning))))
+        is_beyond.append(detector.update(cast(Any, force), cast(Any, torque), turning))
     begins, lasts = is_beyond
-    return len(np.unique(np.cumsum(~lasts)[begins & (felt.times > 1.0)]))
+    return len(np.unique(np.cumsum(~lasts)[begins]))
 
 
 def main(what: str, runs: int, names: Sequence[str]) -> None:

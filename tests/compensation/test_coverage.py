@@ -21,6 +21,7 @@ def chance(share: float, count: float) -> float:
 
 USUAL = [(name, 5) for name in ("poses", "poses and motion", "four poses and motion", "free, turned 3")]
 TOUCHES = [("touched", 2), ("free, touched", 2)]
+MINUTES = [(kind, name, Case(), 1) for kind in KINDS[:4:3] for name in MOTIONS]
 CUT_OFF = Case(sinc_length=512, fir=True)  # at 3.9 Hz: below what a wrist and a polisher do
 BOUNDS = [
     ("typed, tared", "pick", Case(), 20),
@@ -91,9 +92,12 @@ def test_1_n_on_a_tool_of_2_kg_is_contact_within_100_ms(monkeypatch: pytest.Monk
     assert coverage.contacts(stream, felt._replace(force=felt.force + pressed)) >= 19
 
 
-@pytest.mark.long
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("sinc_length", [32, 64, 512])
-@pytest.mark.parametrize("name", MOTIONS)
-def test_in_an_hour_of_every_motion_it_is_contact_at_most_once(name: str, sinc_length: int) -> None:
-    assert coverage.alarms("poses and motion", name, Case(sinc_length=sinc_length), 60, 1000 * SEED) <= 1
+@pytest.mark.parametrize(("kind", "name", "case", "minutes"), more_if_long(MINUTES, [
+    *MINUTES, ("typed, tared", "wrist", Case(), 60),
+    *(("poses and motion", name, case, 60) for name in MOTIONS for case in FILTERS),
+]))  # fmt: skip
+def test_in_an_hour_of_every_motion_it_is_contact_at_most_once(
+    kind: str, name: str, case: Case, minutes: int
+) -> None:
+    assert coverage.alarms(kind, name, case, minutes, 1000 * SEED) <= minutes / 60
