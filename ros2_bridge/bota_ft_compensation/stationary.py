@@ -56,8 +56,10 @@ class StationaryMeans(NamedTuple):
     @property
     def noise(self) -> tuple[float, ...]:
         """Deviations of force, N, and torque, Nm, of a sample from which the mean is subtracted."""
-        share = min(self.alike / self.samples, 0.5)  # of the variance: of the mean, and missing in the window
-        wider = math.sqrt((1.0 + share) / (1.0 - share))
+        # Of the variance: that of the mean, which the window lacks, and 1.5 times that, as few samples leave
+        # unknown how large it is (Student's t).
+        share = min(self.alike / self.samples, 0.5)
+        wider = math.sqrt((1.0 + 2.5 * share) / (1.0 - share))
         return tuple(wider * each for each in self.force_spread + self.torque_spread)
 
 

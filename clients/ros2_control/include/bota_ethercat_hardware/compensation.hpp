@@ -99,6 +99,7 @@ struct Alignment {
         lead = std::min(lead + std::max(1, static_cast<int>(std::ceil(0.004 * rate_hz))), count);
         taps = {lag_s ? fitted(10.0, 9.0, 3, acceleration_noise, std::max(at_s, -kFurthest), counted(0.014), false) : Taps{1.0}, turned(false), turned(true)};
         felt_noise = acceleration_noise * norm(taps[0]), spin_noise = rate_noise * norm(taps[2]), spin_error = fir ? 0.0 : 0.006;
+        tare_noise = acceleration_noise * std::sqrt(period_s);
         Taps passed{1.0};
         if (fir) passed = fir_taps();
         for (std::size_t i = 0; i < 2; ++i) noise_ratios[i] = norm(passed) * std::pow(51200.0 / rate_hz / 51.0, i == 0 ? -0.62 : -0.78);
@@ -109,6 +110,7 @@ struct Alignment {
     int lead;                      ///< this many samples are needed after a gap to tell the instant of force and torque
     std::array<Taps, 3> taps;      ///< to acceleration, angular rate and angular acceleration
     double felt_noise, spin_noise;           ///< deviations that the IMU's noise makes on each axis, m/s^2 and rad/s^2
+    double tare_noise;                       ///< as `felt_noise`, of the mean of a second
     double spin_error;                       ///< what this leaves of angular accelerations, as a share of them
     std::array<double, 2> noise_ratios{};    ///< of force and of torque, to those at SINC 51 with FIR off
 
@@ -192,7 +194,8 @@ public:
         const auto& [xx, yy, zz, xy, xz, yz] = tool.inertia;
         const std::array<Vector3, 3> tensor{{{xx, xy, xz}, {xy, yy, yz}, {xz, yz, zz}}};
         const double mass = tool.mass, weight = square(mass / kNormal), at_arm = 2.0 / 3.0 * sum(tool.center), levers = sum(lever);
-        const double arm = mass * bota_ethercat::detail::dot(tool.center, lever), felt = 3.0 * square(mass * alignment.felt_noise);
+        const double arm = mass * bota_ethercat::detail::dot(tool.center, lever), tare_noise = tared ? alignment.tare_noise : 0.0;
+        const double felt = 3.0 * mass * mass * (square(alignment.felt_noise) + square(tare_noise));
         Vector3 forces{}, torques{};  // squared, of an angular acceleration about each axis
         for (std::size_t i = 0; i < 3; ++i) {
             forces[i] = mass * mass * (levers - square(lever[i]));
