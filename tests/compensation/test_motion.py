@@ -36,7 +36,7 @@ from bota_ft_compensation.quantities import (
 from bota_ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
 from bota_ft_compensation.stationary import StationaryMeans, triple
 from tests.compensation import motion
-from tests.compensation.making import SEED
+from tests.compensation.making import SEED, sample
 from tests.compensation.motion import Felt, Imperfection, imperfect, left_over, settings
 from tests.simulation import more_if_long
 
@@ -292,7 +292,8 @@ def test_many_samples_are_taken_as_one_by_one_to_the_bit() -> None:
             part = slice(begin, begin := min(begin + int(draw.integers(1, 300)), count))
             felt, turned = many.follow_all(rows[part, :3], rows[part, 3:], times[part] / RATE_HZ)
             for row, time_s, *found in zip(rows[part], times[part] / RATE_HZ, felt.T, turned.T, strict=True):
-                expected = one.follow(triple(row[:3]), triple(row[3:]), float(time_s))
+                now = sample(acceleration=triple(row[:3]), angular_rate=triple(row[3:]))
+                expected = one.specific_force(now, float(time_s), 0.0)
                 assert found[0].tolist() == [*expected] if expected else np.isnan(found[0]).all()
                 assert tuple(map(tuple, found[1].T.tolist())) == one.turning
             assert (many.felt, many.turning) == (one.felt, one.turning)
