@@ -18,15 +18,18 @@ for _number, (_row, _column) in enumerate(PLACES):
 _LEVI_CIVITA: Final = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
 
 
-def turning(spin: Array, products: Array) -> tuple[Array, Array]:
-    """(n, 3, 3) times a place: its acceleration; (n, 3, 6) times a tensor: J alpha + omega x J omega.
-
-    Of angular accelerations `spin` (n, 3) and `products` of angular rates (n, 3, 3).
+def on_places(spin: Array, products: Array) -> Array:
+    """(n, 3, 3), times a place, m: its acceleration, by angular acceleration `spin` (n, 3) and `products` of
+    angular rates (n, 3, 3).
     """
     trace = np.trace(products, axis1=1, axis2=2)[:, None, None]
+    return np.asarray(crossing(spin) + products - trace * np.eye(3))
+
+
+def on_tensors(spin: Array, products: Array) -> Array:
+    """(n, 3, 6), times the elements of a tensor: J alpha + omega x J omega, likewise."""
     spun = np.einsum("eij,nj->nie", TENSORS, spin)
-    spun = spun + np.einsum("ijk,njl,elk->nie", _LEVI_CIVITA, products, TENSORS, optimize=True)
-    return crossing(spin) + products - trace * np.eye(3), spun
+    return np.asarray(spun + np.einsum("ijk,njl,elk->nie", _LEVI_CIVITA, products, TENSORS, optimize=True))
 
 
 def crossing(vectors: Array) -> Array:
