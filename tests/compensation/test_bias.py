@@ -139,8 +139,12 @@ def test_it_is_measured_how_alike_filters_make_samples(fir: bool, count: int) ->
     rows = np.tile((*[0.0] * 8, 9.8, *[0.0] * 3), (8000, 1))
     rows[:, :6] += 1e-3 * motion.noise_like(motion.settings(fir=fir), (8000, 6), 5)
     rows[:, 6:] += 1e-3 * np.random.default_rng(5).normal(size=(8000, 6))
-    found = [stationary_means(part, StationaryLimits()).alike for part in np.split(rows, 8000 // count)]
-    assert np.mean(found) == pytest.approx(12.2 if fir else 120 / 66, rel=0.2)
+    parts = np.split(rows, 8000 // count)
+    found = [stationary_means(part, StationaryLimits()) for part in parts]
+    assert np.mean([each.alike for each in found]) == pytest.approx(12.2 if fir else 120 / 66, rel=0.2)
+    errors = [part[:, :6] - each.wrench.values for part, each in zip(parts[1:], found, strict=False)]
+    told = np.square([each.noise for each in found]).mean()
+    assert not errors or 0.97 < math.sqrt(told / np.square(errors).mean()) < 1.15
 
 
 @pytest.mark.parametrize(

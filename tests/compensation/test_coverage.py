@@ -48,8 +48,9 @@ def test_intervals_cover_95_percent(name: str, runs: int) -> None:
             assert runs < 200 or 1.96 * np.sqrt(np.mean(found**2)) > 0.5, (name, what)
 
 
-def test_noise_of_the_accelerometer_along_gravity_does_not_widen_the_interval_of_the_mass() -> None:
-    seed, case = 1000 * SEED, Case(seconds=0.0, sinc_length=512)  # quiet force, 100 samples a pose
+@pytest.mark.parametrize("seed", [1000 * SEED, 6])  # of 6 a chip that is turned only explains less than noise
+def test_noise_of_the_accelerometer_along_gravity_does_not_widen_the_interval_of_the_mass(seed: int) -> None:
+    case = Case(seconds=0.0, sinc_length=512)  # quiet force, 100 samples a pose
     found = coverage.identified(case, motion.tool_of(seed), coverage.imu_of(seed, case), seed)
     by_noise = 1.5 / 9.81 * imu_noise(case.settings)[0] / np.sqrt(6 * 100)  # kg
     assert found.mass_interval < 0.7 * 1.96 * by_noise

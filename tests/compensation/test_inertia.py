@@ -211,8 +211,9 @@ def test_a_touch_is_left_out_with_what_is_near_and_hardly_any_turning_is_noise()
 @pytest.mark.parametrize(
     "chosen",
     [
-        {}, {"fir": True}, {"sinc_length": 128}, {"acceleration_filter": 4}, {"acceleration_filter": 8},
-        {"angular_rate_filter": 5}, {"angular_rate_filter": 6, "fir": True}, {"sinc_length": 32},
+        {}, {"fir": True}, {"sinc_length": 256, "fir": True}, {"sinc_length": 128}, {"sinc_length": 32},
+        {"acceleration_filter": 4}, {"acceleration_filter": 8},
+        {"angular_rate_filter": 5}, {"angular_rate_filter": 6, "fir": True},
     ],
 )  # fmt: skip
 def test_all_that_is_made_of_samples_obeys_the_equations_of_motion(chosen: dict[str, Any]) -> None:
