@@ -153,7 +153,11 @@ class SensorServices:
         offset, spread, residual = (
             known_six(reply.get(key)) or _UNKNOWN for key in ("new_offset", "deviation", "residual")
         )
-        fields = {"bias": tuple(-value for value in offset), "spread": spread, "residual": residual}
+        fields = {
+            "bias": tuple(-value for value in offset),
+            "spread": spread,
+            "residual": residual,
+        }
         return Done(f"sensor {sensor} tared: " + "; ".join(parts), fields)
 
     def get_settings(self, _: Any = None) -> Done:
@@ -197,8 +201,7 @@ class BiasServices:
         bias = estimate_bias(means, payload, specific_force or ZERO).plus(target, -1.0)
         by_imu = specific_force is not None and window.source.is_imu
         accelerometer = control.parameters.accelerometer if by_imu else None
-        spread = means.force_spread + means.torque_spread
-        noise = at_reference(spread, control.output.stream.in_force.info.settings)
+        noise = at_reference(means.noise, control.output.stream.in_force.info.settings)
         control.set_bias(bias, "tare", TareBasis(payload, specific_force, accelerometer, noise))
         weight = f"the weight of tool_mass {payload.mass:.3g} kg is not part of it"
         if not payload.mass:
@@ -207,7 +210,11 @@ class BiasServices:
                 "this orientation only"
             )
         residual = means.latest.plus(means.wrench, -1.0)
-        fields = {"bias": bias.values, "spread": spread, "residual": residual.values}
+        fields = {
+            "bias": bias.values,
+            "spread": means.force_spread + means.torque_spread,
+            "residual": residual.values,
+        }
         return Done(f"bias of {means.samples} samples: {wrench_text(bias)}; {weight}", fields)
 
     def clear(self) -> Done:

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
-from bota_ethercat.sensor.response import healthy_noise, noise_ratios
+from bota_ethercat.sensor.response import healthy_noise, imu_noise, noise_ratios
 from bota_ethercat.settings import SettingValue
 from bota_ft_compensation.alignment import Alignment
 from bota_ft_compensation.bias import TareBasis
@@ -85,10 +85,12 @@ class Bounds:
             for i, row in enumerate(_matrix(tensor))
         ]
         at_arm, (felt, spin) = 2.0 / 3.0 * _squared(center), (each * each for each in alignment.noise())
+        is_tared = taken.specific_force != ZERO
+        if is_tared:  # with the mean of a second
+            felt += imu_noise(alignment.settings)[0] ** 2 * alignment.period_s
         felt = 3.0 * mass * mass * felt
         self.imu = by_imu * (felt + sum(forces) * spin), by_imu * (at_arm * felt + sum(torques) * spin)
         self._fixed = self.imu[0] + _squared(self.noise[:3]), self.imu[1] + _squared(self.noise[3:])
-        is_tared = taken.specific_force != ZERO
         self._from = taken.specific_force if is_tared else ZERO
         is_same = is_tared and taken.accelerometer == accelerometer
         wrong = 0.0 if alignment.settings.get("fir") else _ALIGNED**2
@@ -122,7 +124,7 @@ class Bounds:
 
         Components may be arrays of samples.
         """
-        (x, y, z), ((wx, wy, wz), (ax, ay, az)) = felt, turning
+        (x, y, z), ((wx, wy, wz), (ax, ay, az), *_) = felt, turning
         if self._from is None:  # unknown: on average
             x = y = z = STANDARD_GRAVITY * math.sqrt(2.0 / 3.0)
         else:

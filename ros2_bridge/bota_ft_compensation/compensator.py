@@ -67,10 +67,13 @@ class Compensator:
 def _inertial_torque(inertia: tuple[float, ...], turning: Turning) -> Vector3:
     """J alpha + omega x J omega, Nm: what it takes to turn a tool so."""
     xx, yy, zz, xy, xz, yz = inertia
-    (wx, wy, wz), (ax, ay, az) = turning
-    lx, ly, lz = xx * wx + xy * wy + xz * wz, xy * wx + yy * wy + yz * wz, xz * wx + yz * wy + zz * wz
+    if len(turning) > 2:
+        _, (ax, ay, az), (wxx, wyy, wzz), (wxy, wxz, wyz) = turning
+    else:
+        (wx, wy, wz), (ax, ay, az) = turning
+        wxx, wyy, wzz, wxy, wxz, wyz = wx * wx, wy * wy, wz * wz, wx * wy, wx * wz, wy * wz
     return (
-        xx * ax + xy * ay + xz * az + wy * lz - wz * ly,
-        xy * ax + yy * ay + yz * az + wz * lx - wx * lz,
-        xz * ax + yz * ay + zz * az + wx * ly - wy * lx,
+        xx * ax + xy * ay + xz * az + xz * wxy - xy * wxz + yz * (wyy - wzz) + (zz - yy) * wyz,
+        xy * ax + yy * ay + yz * az + xy * wyz - yz * wxy + xz * (wzz - wxx) + (xx - zz) * wxz,
+        xz * ax + yz * ay + zz * az + yz * wxz - xz * wyz + xy * (wxx - wyy) + (yy - xx) * wxy,
     )

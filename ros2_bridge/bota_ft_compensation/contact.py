@@ -230,7 +230,7 @@ class ContactDetector:
         return self.is_contact
 
     def _spun(self, turning: Turning) -> float:
-        (x, y, z), (a, b, c) = turning
+        (x, y, z), (a, b, c), *_ = turning
         return self._spin * (a * a + b * b + c * c + (x * x + y * y + z * z) ** 2)
 
     def locate(self, force: Vector3, torque: Vector3, turning: Turning = STILL) -> Contact:

@@ -105,19 +105,15 @@ class ImuSource(Source):
         return cx - x, cy - y, cz - z
 
     def specific_force(self, sample: Sample, time_s: float, stamp_s: float) -> Vector3 | None:  # noqa: ARG002
-        return self.follow(sample.acceleration, sample.angular_rate, time_s)
-
-    def follow(self, acceleration: Vector3, angular_rate: Vector3, time_s: float) -> Vector3 | None:
-        """As `specific_force`, of a sample's m/s² and rad/s."""
-        found = self._imu.follow(acceleration, angular_rate, time_s)
+        found = self._imu.follow(sample.acceleration, sample.angular_rate, time_s)
         self.turning = self._imu.turning
-        if found is None or not any(acceleration):
+        if found is None or not any(sample.acceleration):
             return None
         self.felt = found
         return found
 
     def follow_all(self, acceleration: Array, angular_rate: Array, times: Array) -> tuple[Array, Array]:
-        """As `follow`, of samples (n, 3) at `times` (n,): (3, n), NaN for None, and `turning` (2, 3, n)."""
+        """As `specific_force`, of samples (n, 3) at `times` (n,): as `ImuSpecificForce.follow_all`."""
         felt, turned = self._imu.follow_all(np.hstack([acceleration, angular_rate]), times)
         self.turning = self._imu.turning
         felt[:, ~acceleration.any(axis=1)] = math.nan

@@ -22,7 +22,9 @@ class CompensationError(Exception):
     """Something cannot be estimated or identified; the text is one sentence for people."""
 
 
-Turning = tuple[Vector3, Vector3]  # angular rate, rad/s, and angular acceleration, rad/s²
+# Angular rate, rad/s, and angular acceleration, rad/s²; behind a filter that passes products of rates
+# otherwise also these, (rad/s)²: xx yy zz, and xy xz yz.
+Turning = tuple[Vector3, ...]
 STILL: Final[Turning] = (ZERO, ZERO)
 UPRIGHT: Final[Vector3] = (0.0, 0.0, STANDARD_GRAVITY)  # specific force at rest
 

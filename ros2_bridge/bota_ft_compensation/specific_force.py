@@ -34,6 +34,7 @@ from bota_ft_compensation.quantities import (
     Quaternion,
     Turning,
 )
+from bota_ft_compensation.turning import PLACES, TENSORS
 
 _TURNING: Final = 0.05  # rad/s: less is a gyroscope's offset
 _PUSHED: Final = 0.5  # m/s²: less is an accelerometer's noise
@@ -58,23 +59,31 @@ class ImuSpecificForce:
         """
         self.lever = lever
         # Angular rate (rad/s) and acceleration (rad/s²) of the latest sample, at force and torque's instant.
-        self.turning = STILL
+        self.turning: Turning = STILL
         # What is read is corrected once it is aligned, which is linear, and exact of what is constant.
         self._base = accelerometer.correct(ZERO)
-        self._corrected = np.zeros((6, 6))
+        whole, rates = np.zeros((12, 12)), np.reshape(gyroscope, (3, 3))
         axes = (accelerometer.correct(axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-        self._corrected[:3, :3] = np.array([*axes]) - self._base
-        self._corrected[3:, 3:] = np.reshape(gyroscope, (3, 3)).T
+        whole[:3, :3] = np.array([*axes]) - self._base
+        whole[3:6, 3:6] = rates.T
+        both = rates @ TENSORS @ rates.T
+        whole[6:, 6:] = np.stack([both[:, row, column] for row, column in PLACES], axis=1)
+        self._whole = whole
         self.align(alignment or align({}))
 
     def align(self, alignment: Alignment) -> None:
         """Bring what follows to the instant of force and torque so."""
         self.alignment = alignment
         self._size = alignment.taps.shape[1]
-        self._rows = np.zeros((_ROOM * self._size, 6))
+        # The FIR filter is so slow that products of rates pass it otherwise than as products of what passes.
+        self._has_products = bool(alignment.settings.get("fir")) and alignment.lag_s is not None
+        width = 12 if self._has_products else 6
+        self._corrected = np.ascontiguousarray(self._whole[:width, :width])
+        self._rows = np.zeros((_ROOM * self._size, width))
         self._end, self._filled = self._size, 0
         self._moved = False  # before the latest gap, or in it
         self._time_s = -math.inf
+        self.turning = (ZERO,) * (4 if self._has_products else 2)
 
     def follow(self, acceleration: Vector3, angular_rate: Vector3, time_s: float) -> Vector3 | None:
         """m/s² at the center of gravity, when force and torque of this sample were (m/s², rad/s).
@@ -82,12 +91,14 @@ class ImuSpecificForce:
         None if it is not finite, or if the sensor moves, or did before a gap, and what was just before the
         sample, and so how fast it spins up, is not known.
         """
-        row = (*acceleration, *angular_rate)
+        row: Row = (*acceleration, *angular_rate)
         total = sum(row)
         if total - total != 0.0:  # NaN or infinity
             self._time_s = -math.inf
             return None
         passed_s, self._time_s = time_s - self._time_s, time_s
+        if self._has_products:
+            row = (*row, *_products(*angular_rate))
         dx, dy, dz = self.lever
         lead, filled = self.alignment.lead, self._filled
         if 0.0 < passed_s <= self.alignment.gap_s:
@@ -99,7 +110,7 @@ class ImuSpecificForce:
         else:
             if filled:
                 before = self._rows[self._end - self._size : self._end]
-                turned, pushed = (before[:, 3:] ** 2).sum(axis=1), math.dist(before[-1, :3], row[:3])
+                turned, pushed = (before[:, 3:6] ** 2).sum(axis=1), math.dist(before[-1, :3], row[:3])
                 self._moved = bool(turned.max() > _TURNING**2) or pushed > _PUSHED
             self._filled, self._end = 1, self._size
             self._rows[: self._size] = row
@@ -110,12 +121,12 @@ class ImuSpecificForce:
         return felt
 
     def follow_all(self, rows: Array, times: Array) -> tuple[Array, Array]:
-        """As `follow` of each, to the bit: (3, n), NaN for None, and every `turning` (2, 3, n).
+        """As `follow` of each, to the bit: (3, n), NaN for None, and every `turning` (2 or 4, 3, n).
 
         Of `rows` (n, 6), m/s² and rad/s, those that follow one another without a gap are taken at once.
         """
         count, size, begin = len(rows), self._size, 0
-        felt, turned = np.empty((3, count)), np.empty((2, 3, count))
+        felt, turned = np.empty((3, count)), np.empty((4 if self._has_products else 2, 3, count))
         good = np.asarray(np.isfinite(rows).all(axis=1))
         passed_s = np.diff(times, prepend=self._time_s)
         most_s = min(self.alignment.gap_s, 1.5 * self.alignment.period_s)
@@ -129,7 +140,10 @@ class ImuSpecificForce:
                 felt[:, begin], turned[:, :, begin], begin = now or math.nan, self.turning, begin + 1
                 continue
             end = ends[begin]
-            held = np.concatenate([self._rows[self._end - size + 1 : self._end], rows[begin:end]])
+            wide = rows[begin:end]
+            if self._has_products:
+                wide = np.column_stack([wide, *_products(*wide[:, 3:].T)])
+            held = np.concatenate([self._rows[self._end - size + 1 : self._end], wide])
             # Multiplied one by one: the sums of a larger product would be in another order.
             found = self.alignment.taps @ sliding_window_view(held, size, axis=0).swapaxes(1, 2)
             part, begin = slice(begin, end), end
@@ -137,21 +151,27 @@ class ImuSpecificForce:
             self._rows[:size] = held[-size:]
             self._end, self._filled = size, self._filled + len(found)
             self._time_s = times[end - 1].item()
-            (wx, wy, wz), (tx, ty, tz) = turned[:, :, end - 1].tolist()
-            self.turning = (wx, wy, wz), (tx, ty, tz)
+            self.turning = tuple((x, y, z) for x, y, z in turned[:, :, end - 1].tolist())
         return felt, turned
 
     def _at_center(self, aligned: Any) -> tuple[Vector3, Turning]:
-        """Specific force and turning, by readings (3, 6) of a sample, or of many."""
-        (ax, ay, az, _, _, _), (_, _, _, wx, wy, wz), (_, _, _, tx, ty, tz) = aligned
+        """Specific force and turning, by readings (3, 6 or 12) of a sample, or of many."""
         (bx, by, bz), (dx, dy, dz) = self._base, self.lever
-        vx, vy, vz = wy * dz - wz * dy, wz * dx - wx * dz, wx * dy - wy * dx
+        if self._has_products:
+            (ax, ay, az, *_), (_, _, _, wx, wy, wz, xx, yy, zz, xy, xz, yz), (_, _, _, tx, ty, tz, *_) = (
+                aligned
+            )
+            turning: Turning = (wx, wy, wz), (tx, ty, tz), (xx, yy, zz), (xy, xz, yz)
+        else:
+            (ax, ay, az, _, _, _), (_, _, _, wx, wy, wz), (_, _, _, tx, ty, tz) = aligned
+            turning = (wx, wy, wz), (tx, ty, tz)
+            xx, yy, zz, xy, xz, yz = wx * wx, wy * wy, wz * wz, wx * wy, wx * wz, wy * wz
         felt = (
-            ax + bx + ty * dz - tz * dy + wy * vz - wz * vy,
-            ay + by + tz * dx - tx * dz + wz * vx - wx * vz,
-            az + bz + tx * dy - ty * dx + wx * vy - wy * vx,
+            ax + bx + ty * dz - tz * dy + xy * dy + xz * dz - (yy + zz) * dx,
+            ay + by + tz * dx - tx * dz + xy * dx + yz * dz - (xx + zz) * dy,
+            az + bz + tx * dy - ty * dx + xz * dx + yz * dy - (xx + yy) * dz,
         )
-        return felt, ((wx, wy, wz), (tx, ty, tz))
+        return felt, turning
 
     def _bridge(self, row: Row, passed_s: float) -> None:
         """The samples that were lost before one that comes so long after the one before."""
@@ -176,6 +196,10 @@ class ImuSpecificForce:
             self._end = self._size
         self._rows[self._end] = row
         self._end += 1
+
+
+def _products(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
+    return x * x, y * y, z * z, x * y, x * z, y * z
 
 
 def _turns(rate: Sequence[float]) -> bool:

@@ -53,6 +53,15 @@ class StationaryMeans(NamedTuple):
     # Variance of means of force and torque, against that of as many samples that filters do not make alike.
     alike: float = 1.0
 
+    @property
+    def noise(self) -> tuple[float, ...]:
+        """Deviations of force, N, and torque, Nm, of a sample from which the mean is subtracted."""
+        # Of the variance: that of the mean, which the window lacks, and 1.5 times that, as few samples leave
+        # unknown how large it is (Student's t).
+        share = min(self.alike / self.samples, 0.5)
+        wider = math.sqrt((1.0 + 2.5 * share) / (1.0 - share))
+        return tuple(wider * each for each in self.force_spread + self.torque_spread)
+
 
 class StationaryWindow:
     """Collects the samples of one window. `add` until it is true, then `means`."""
@@ -130,8 +139,10 @@ def stationary_means(rows: Array, limits: StationaryLimits) -> StationaryMeans:
     of_force, of_torque, of_acceleration = (triple(spread[first : first + 3]) for first in (0, 3, 6))
     latest = Wrench.of(rows[-len(rows) // _BLOCKS :, :6].mean(axis=0))
     noise = (rows[:, :6] - mean[:6]) / (spread[:6] + _NO_LIMIT)
-    pairs = [float((noise[by:] * noise[:-by]).sum()) for by in range(1, min(_ALIKE, len(rows)))]
-    alike = max(1.0, 1.0 + 2.0 * sum(pairs) / noise.size)
+    lags = range(1, min(_ALIKE, len(rows) // 4 + 1))
+    pairs = sum(float((noise[by:] * noise[:-by]).sum()) for by in lags) / noise.size
+    # Noise less its own mean lacks some of that at every lag.
+    alike = max(1.0, (1.0 + 2.0 * pairs) / (1.0 - (2.0 * len(lags) + 1.0) / len(rows)))
     return StationaryMeans(
         Wrench(f, t), a, of_force, of_torque, len(rows), of_acceleration, latest=latest, alike=alike
     )

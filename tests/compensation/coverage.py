@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import math
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -28,7 +27,7 @@ from bota_ethercat.stream.timeline import InForce
 from bota_ft_compensation.alignment import align
 from bota_ft_compensation.bias import TareBasis, estimate_bias
 from bota_ft_compensation.bounds import at_reference
-from bota_ft_compensation.contact import Plane
+from bota_ft_compensation.contact import ContactDetector, Plane
 from bota_ft_compensation.identification.free_motion import identify_in_motion
 from bota_ft_compensation.identification.inertia import turn
 from bota_ft_compensation.identification.parameter_file import stream_of, write_payload, write_yaml
@@ -204,6 +203,8 @@ def intervals(case: Case, runs: int, first: int = 0) -> tuple[dict[str, Array], 
             "scale": (read.scale, read.scale_interval, scale),
             "crossed": (read.cross_axis, read.cross_axis_interval, crossed),
         }
+        if case.poses:
+            rows["bias"] = found.bias.values, found.bias_interval.values, BIAS.values
         if case.seconds:
             rows["tensor"] = payload.inertia, payload.inertia_interval, tool.inertia
         for name, (value, half, truth) in rows.items():
@@ -289,7 +290,7 @@ def tare(stream: CompensatedStream, rows: Array) -> None:
     plan, means = stream.plan, stationary_means(rows, _ROOM)
     x, y, z = plan.accelerometer.correct(means.acceleration)
     bias = estimate_bias(means, plan.payload, (x, y, z))
-    noise = at_reference(means.force_spread + means.torque_spread, stream.in_force.info.settings)
+    noise = at_reference(means.noise, stream.in_force.info.settings)
     taken = TareBasis(plan.payload, (x, y, z), plan.accelerometer, noise)
     stream.plan = plan._replace(ramp=plan.ramp.go(bias, 0.0, taken=taken))
 
@@ -331,19 +332,22 @@ def alarms(kind: str, name: str, case: Case, minutes: int, first: int = 0) -> in
 def contacts(stream: CompensatedStream, felt: Felt) -> int:
     """How often contact begins, after a second."""
     detector = stream.contact_detector(Plane((0.0, 0.0, 0.1), (0.0, 0.0, 1.0), 0.05))
-    source, rows = stream.plan.source, []
+    source = stream.plan.source
     assert isinstance(source, ImuSource)
     source.configure(stream.in_force)
-    for time_s, _, _, read, rate in zip(*(part.tolist() for part in felt), strict=True):
-        at = source.follow(read, rate, time_s)
-        rows.append((at or (math.nan,) * 3, *source.turning))
-    at, *turning = cast(Any, np.moveaxis(np.array(rows), 0, 2))
+    at, turning = source.follow_all(felt.acceleration, felt.rate, felt.times)
     columns = SimpleNamespace(force=felt.force.T, torque=felt.torque.T)
-    final, is_beyond = stream.stages(columns, 0.0, at, turning).final, []
+    final, late = stream.stages(columns, 0.0, cast(Any, at), cast(Any, turning)).final, felt.times > 1.0
+    return begun(detector, *(part[..., late] for part in (*map(np.array, final), turning)))
+
+
+def begun(detector: ContactDetector, force: Array, torque: Array, turning: Any) -> int:
+    """How often contact begins, of samples (3, n); `turning` (2, 3, n)."""
+    is_beyond: list[Any] = []
     for detector.is_contact in (False, True):  # of the limits of the beginning and of the end
-        is_beyond.append(cast(Any, detector.update(*final, turning)))
+        is_beyond.append(detector.update(cast(Any, force), cast(Any, torque), turning))
     begins, lasts = is_beyond
-    return len(np.unique(np.cumsum(~lasts)[begins & (felt.times > 1.0)]))
+    return len(np.unique(np.cumsum(~lasts)[begins]))
 
 
 def main(what: str, runs: int, names: Sequence[str]) -> None:

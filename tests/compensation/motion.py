@@ -7,9 +7,9 @@ is felt follows from them by differences on a grid that is fine enough.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from itertools import pairwise
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,6 @@ from bota_ft_compensation.quantities import (
     SCALE_PRIOR,
     Accelerometer,
     Payload,
-    Turning,
     Wrench,
 )
 from bota_ft_compensation.specific_force import ImuSpecificForce
@@ -224,7 +223,7 @@ class Left(NamedTuple):
     times: Array  # (n,) s
     force: Array  # (n, 3) N
     torque: Array  # (n, 3) Nm
-    turning: Sequence[Turning]  # of each
+    turning: Array  # (2 or 4, 3, n)
     felt: Array  # (n, 3) m/s²: specific force at the center of gravity
 
     @property
@@ -250,15 +249,11 @@ def left_over(
     """Of these samples, with no contact; samples that are withheld are missing."""
     x, y, z = (center - imu for center, imu in zip(tool.center, IMU, strict=True))
     imu, compensator = ImuSpecificForce((x, y, z), accelerometer, alignment), Compensator(tool, bias)
-    rows, turnings = [], []
-    for time_s, force, torque, acceleration, rate in zip(*(part.tolist() for part in felt), strict=True):
-        specific = imu.follow((*acceleration,), (*rate,), time_s)
-        if specific is not None and time_s >= settling_s:
-            final = compensator.compensate((*force,), (*torque,), specific, imu.turning).final
-            rows.append((time_s, *final.values, *specific))
-            turnings.append(imu.turning)
-    found = np.array(rows)
-    return Left(found[:, 0], found[:, 1:4], found[:, 4:7], turnings, found[:, 7:])
+    specific, turning = cast(Any, imu.follow_all(np.hstack([felt.acceleration, felt.rate]), felt.times))
+    final = compensator.compensate(cast(Any, felt.force.T), cast(Any, felt.torque.T), specific, turning).final
+    kept = np.isfinite(specific[0]) & (felt.times >= settling_s)
+    rows = np.vstack([felt.times, *final, specific])[:, kept]
+    return Left(rows[0], rows[1:4].T, rows[4:7].T, turning[..., kept], rows[7:].T)
 
 
 def tensor(inertia: tuple[float, ...] | Array) -> Array:

@@ -19,13 +19,16 @@ import pytest
 from bota_clients.errors import RecordingError
 from bota_clients.identify.cli import main
 from bota_clients.identify.tool_file import read_bota, write_bota
+from bota_ethercat.replies import SensorInfo
 from bota_ethercat.settings import start_up_defaults
-from bota_ft_compensation.alignment import align
-from bota_ft_compensation.quantities import Accelerometer, Payload, Wrench
+from bota_ethercat.stream.timeline import InForce
+from bota_ft_compensation.identification.parameter_file import stream_of
+from bota_ft_compensation.quantities import Payload
 from tests.clients.test_identify import record_felt
 from tests.compensation import motion
+from tests.compensation.coverage import arrays
 from tests.compensation.making import BIAS, SEED, written_parameters
-from tests.compensation.motion import IMU, Array, Felt, left_over, tool_of
+from tests.compensation.motion import IMU, Array, Felt, tool_of
 from tests.compensation.motion import Path as Motion
 from tests.compensation.test_inertia import FORCE_NOISE, TORQUE_NOISE, rms
 from tests.ended import run_here
@@ -102,14 +105,9 @@ def ours(felt: Felt, path: Path) -> tuple[bool, str]:
 
 
 def left_by_ours(felt: Felt, parameters: dict[str, Any]) -> Array:
-    tool = Payload(
-        parameters["tool_mass"],
-        *(tuple(parameters[f"tool_{name}"]) for name in ("center_of_gravity", "inertia")),
-    )
-    known = Accelerometer(*(tuple(parameters[f"accelerometer.{name}"]) for name in Accelerometer._fields))
-    bias = Wrench.of(parameters["bias"])
-    left = left_over(felt, tool, align(SETTINGS, RATE_HZ), known, settling_s=FROM_S, bias=bias)
-    return np.hstack([left.force, left.torque])
+    stream = stream_of(parameters)
+    stream.configure(InForce(SensorInfo(rate_hz=RATE_HZ, settings=SETTINGS, offset=(0.0,) * 6)))
+    return stream.compensate(arrays(felt))[0][felt.times >= FROM_S]
 
 
 @pytest.fixture(scope="module")

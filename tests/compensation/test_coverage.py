@@ -7,6 +7,7 @@ import functools
 import numpy as np
 import pytest
 
+from bota_ethercat.sensor.response import imu_noise
 from tests.compensation import coverage, motion
 from tests.compensation.coverage import CASES, KINDS, MOTIONS, Case, bounds, intervals, judged
 from tests.compensation.making import SEED
@@ -20,14 +21,16 @@ def chance(share: float, count: float) -> float:
 
 USUAL = [(name, 5) for name in ("poses", "poses and motion", "four poses and motion", "free, turned 3")]
 TOUCHES = [("touched", 2), ("free, touched", 2)]
+MINUTES = [(kind, name, Case(), 1) for kind in KINDS[:4:3] for name in MOTIONS]
+CUT_OFF = Case(sinc_length=512, fir=True)  # at 3.9 Hz: below what a wrist and a polisher do
 BOUNDS = [
     ("typed, tared", "pick", Case(), 20),
     ("poses and motion", "polishing", Case(), 2),
     ("free motion", "hand-guided", Case(sinc_length=512), 2),
     ("free motion", "rest", Case(fir=True), 2),
+    ("poses and motion", "polishing", CUT_OFF, 4),
 ]
 FILTERS = [Case(sinc_length=size, fir=fir) for size in (32, 64, 512) for fir in (False, True)]
-CUT_OFF = Case(sinc_length=512, fir=True)  # at 3.9 Hz: below what a wrist and a polisher do
 
 
 @pytest.mark.timeout(3600)
@@ -45,6 +48,14 @@ def test_intervals_cover_95_percent(name: str, runs: int) -> None:
             assert runs < 200 or 1.96 * np.sqrt(np.mean(found**2)) > 0.5, (name, what)
 
 
+@pytest.mark.parametrize("seed", [1000 * SEED, 6])  # of 6 a chip that is turned only explains less than noise
+def test_noise_of_the_accelerometer_along_gravity_does_not_widen_the_interval_of_the_mass(seed: int) -> None:
+    case = Case(seconds=0.0, sinc_length=512)  # quiet force, 100 samples a pose
+    found = coverage.identified(case, motion.tool_of(seed), coverage.imu_of(seed, case), seed)
+    by_noise = 1.5 / 9.81 * imu_noise(case.settings)[0] / np.sqrt(6 * 100)  # kg
+    assert found.mass_interval < 0.7 * 1.96 * by_noise
+
+
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize(("name", "runs"), more_if_long(
     TOUCHES, TOUCHES + [(name, 100) for name, _ in TOUCHES]
@@ -59,7 +70,7 @@ def test_a_touch_is_named(name: str, runs: int) -> None:
 @pytest.mark.parametrize(("kind", "name", "case", "runs"), more_if_long(
     BOUNDS, BOUNDS + [
         (kind, name, case, 100 if "typed" in kind else 20) for kind in KINDS for name in MOTIONS
-        for case in FILTERS if case != CUT_OFF or name in {"rest", "pick"}
+        for case in FILTERS
     ]
 ))  # fmt: skip
 def test_in_95_percent_of_samples_the_error_is_within_the_bounds(
@@ -67,7 +78,7 @@ def test_in_95_percent_of_samples_the_error_is_within_the_bounds(
 ) -> None:
     force, force_wide, left, torque, torque_wide, _ = judged(bounds(kind, name, case, runs, 1000 * SEED))
     assert (force > 92.0, torque > 92.0) == (True, True)
-    assert case == CUT_OFF or (force_wide < 1.6, torque_wide < 1.6) == (True, True)
+    assert (case, kind) == (CUT_OFF, "free motion") or max(force_wide, torque_wide) < 1.6
     if (name, case, "motion" in kind) == ("polishing", Case(), True):
         assert left < 0.30
 
@@ -82,9 +93,12 @@ def test_1_n_on_a_tool_of_2_kg_is_contact_within_100_ms(monkeypatch: pytest.Monk
     assert coverage.contacts(stream, felt._replace(force=felt.force + pressed)) >= 19
 
 
-@pytest.mark.long
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("sinc_length", [32, 64, 512])
-@pytest.mark.parametrize("name", MOTIONS)
-def test_in_an_hour_of_every_motion_it_is_contact_at_most_once(name: str, sinc_length: int) -> None:
-    assert coverage.alarms("poses and motion", name, Case(sinc_length=sinc_length), 60, 1000 * SEED) <= 1
+@pytest.mark.parametrize(("kind", "name", "case", "minutes"), more_if_long(MINUTES, [
+    *MINUTES, ("typed, tared", "wrist", Case(), 60),
+    *(("poses and motion", name, case, 60) for name in MOTIONS for case in FILTERS),
+]))  # fmt: skip
+def test_in_an_hour_of_every_motion_it_is_contact_at_most_once(
+    kind: str, name: str, case: Case, minutes: int
+) -> None:
+    assert coverage.alarms(kind, name, case, minutes, 1000 * SEED) <= minutes / 60

@@ -24,9 +24,10 @@ from bota_ft_compensation.identification.free_motion import (
     _together,
     identify_in_motion,
 )
-from bota_ft_compensation.identification.inertia import Turned, crossing, turn
+from bota_ft_compensation.identification.inertia import Turned, turn
 from bota_ft_compensation.identification.payload import Identified, Joint
 from bota_ft_compensation.quantities import EXACT, CompensationError, Payload, likely_inertia
+from bota_ft_compensation.turning import crossing
 from tests.compensation import motion
 from tests.compensation.making import BIAS, SEED, check_coverage
 from tests.compensation.motion import IMU, Array, Felt, imperfect, settings, tensor, tool_of
@@ -191,10 +192,8 @@ def instants(reads: Sequence[Read]) -> Turned:
     rate, spin = np.array([each.rate for each in reads]), np.array([each.spin for each in reads])
     arm = crossing(spin) + crossing(rate) @ crossing(rate)
     felt = np.array([each.acceleration for each in reads]) - arm @ np.array(IMU)
-    spun = [[tensor(row) @ s + np.cross(w, tensor(row) @ w) for row in np.eye(6)]
-            for w, s in zip(rate, spin, strict=True)]  # fmt: skip
     nothing, times = np.zeros((len(reads), 3)), np.array([60.0 * each.minute for each in reads])
-    return Turned(nothing, nothing, felt, arm, np.moveaxis(np.array(spun), 1, 2), times)
+    return Turned(nothing, nothing, felt, spin, rate[:, :, None] * rate[:, None], times)
 
 
 def test_the_design_is_that_of_the_equations_of_motion_and_all_derivatives() -> None:

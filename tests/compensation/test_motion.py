@@ -36,7 +36,7 @@ from bota_ft_compensation.quantities import (
 from bota_ft_compensation.specific_force import ImuSpecificForce, QuaternionGravity
 from bota_ft_compensation.stationary import StationaryMeans, triple
 from tests.compensation import motion
-from tests.compensation.making import SEED
+from tests.compensation.making import SEED, sample
 from tests.compensation.motion import Felt, Imperfection, imperfect, left_over, settings
 from tests.simulation import more_if_long
 
@@ -206,13 +206,14 @@ class Slowly:
 
     def __init__(self, lever: Vector3, known: Accelerometer, gyroscope: Array, alignment: Alignment) -> None:
         self.lever, self.known, self.gyroscope, self.alignment = np.array(lever), known, gyroscope, alignment
-        self.rows, self.since, self.moved, self.last_s = np.zeros((0, 6)), 0, False, -math.inf
+        self.rows, self.since, self.moved, self.last_s = np.zeros((0, 15)), 0, False, -math.inf
 
     def follow(self, row: Array, time_s: float) -> Array | None:
         size, lead = self.alignment.taps.shape[1], self.alignment.lead
         if not np.isfinite(row).all():
             self.last_s = -math.inf
             return None
+        row = np.concatenate([row, np.outer(row[3:], row[3:]).ravel()])
         periods = round((time_s - self.last_s) / self.alignment.period_s) if self.last_s > -math.inf else 0
         if 0.0 < time_s - self.last_s <= self.alignment.gap_s:
             missing = np.linspace(self.rows[-1], row, max(periods, 1) + 1)[1:]
@@ -224,19 +225,20 @@ class Slowly:
                 self.rows = np.vstack([first - (ago[::-1] + 1) * slope, known])
         else:
             if self.since:
-                fastest = np.linalg.norm(self.rows[-size:, 3:], axis=1).max()
+                fastest = np.linalg.norm(self.rows[-size:, 3:6], axis=1).max()
                 pushed = np.linalg.norm(self.rows[-1, :3] - row[:3])
                 self.moved = bool(fastest > 0.05 or pushed > 0.5)
             self.rows, self.since = np.tile(row, (size, 1)), 1
         self.last_s = time_s
-        if self.since < lead and self.lever.any() and (self.moved or np.linalg.norm(row[3:]) > 0.05):
+        if self.since < lead and self.lever.any() and (self.moved or np.linalg.norm(row[3:6]) > 0.05):
             return None
-        (felt, *_), (_, rate), (_, spin) = (
-            np.split(each, 2) for each in self.alignment.taps @ self.rows[-size:]
-        )
-        rate, spin = self.gyroscope @ rate, self.gyroscope @ spin
-        arm = np.cross(spin, self.lever) + np.cross(rate, np.cross(rate, self.lever))
-        return np.concatenate([self.known.correct(tuple(felt)) + arm, rate, spin])
+        felt, rates, slopes = self.alignment.taps @ self.rows[-size:]
+        rate, spin = self.gyroscope @ rates[3:6], self.gyroscope @ slopes[3:6]
+        products = self.gyroscope @ rates[6:].reshape(3, 3) @ self.gyroscope.T
+        if not self.alignment.settings["fir"]:
+            products = np.outer(rate, rate)
+        arm = np.cross(spin, self.lever) + products @ self.lever - np.trace(products) * self.lever
+        return np.concatenate([self.known.correct(tuple(felt[:3])) + arm, rate, spin])
 
 
 @pytest.mark.parametrize("seed", range(16))
@@ -290,7 +292,8 @@ def test_many_samples_are_taken_as_one_by_one_to_the_bit() -> None:
             part = slice(begin, begin := min(begin + int(draw.integers(1, 300)), count))
             felt, turned = many.follow_all(rows[part, :3], rows[part, 3:], times[part] / RATE_HZ)
             for row, time_s, *found in zip(rows[part], times[part] / RATE_HZ, felt.T, turned.T, strict=True):
-                expected = one.follow(triple(row[:3]), triple(row[3:]), float(time_s))
+                now = sample(acceleration=triple(row[:3]), angular_rate=triple(row[3:]))
+                expected = one.specific_force(now, float(time_s), 0.0)
                 assert found[0].tolist() == [*expected] if expected else np.isnan(found[0]).all()
                 assert tuple(map(tuple, found[1].T.tolist())) == one.turning
             assert (many.felt, many.turning) == (one.felt, one.turning)

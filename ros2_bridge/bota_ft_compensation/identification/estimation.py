@@ -105,8 +105,8 @@ def estimate(
 
     Also `acceleration` (..., n, 3), m/s², if gravity is from it, with `acceleration_variance` (...,) of its
     means by the sensor's noise, (m/s²)², of whose calibration `prior` is assumed; or `is_turned` to have the
-    mounting found; and the `regressor` (..., n). `noise` (6,): variances of the six axes that explain what
-    is left, and so are assumed. LinAlgError if an unknown is open.
+    mounting found; and the `regressor` (..., n). `noise` (n, 6, 6): times what noise
+    leaves of a pose, six independent numbers of variance 1. LinAlgError if an unknown is open.
     """
     if regressor is not None:  # of several regressors, each is a problem
         many = regressor.shape[:-1]
@@ -258,7 +258,7 @@ def _with_accelerometer(
     assumed[..., 6] = _LENGTH_DEVIATION**2 + noise
     degrees = np.array([0.0] * 6 + [_LENGTH_DEGREES])
     if explained is not None:
-        assumed[..., :6], degrees[:6] = explained, _NOISE_DEGREES
+        assumed[..., :6], degrees[:6] = 1.0, _NOISE_DEGREES
     lengths = Known(prior, _FLOOR[6:] ** 2, degrees[6:], assumed[..., 6:])
     calibration = np.zeros((*measured.shape[:-2], _OF_CALIBRATION))
     for _ in range(_LENGTH_ROUNDS):
@@ -273,7 +273,9 @@ def _with_accelerometer(
     unknowns = answer.shape[-1]
     information = np.zeros((unknowns, unknowns))
     information[linear:, linear:] = prior
-    least = _LEAST_SHARE * variances if explained is None else 0.0
+    least = _LEAST_SHARE * variances
+    if explained is not None:
+        least, variances[..., :6] = np.zeros(7), 1.0
     known = Known(information, np.maximum(least, _FLOOR**2), degrees, assumed)
     for _ in range(_ROUNDS):
         design = np.zeros((*measured.shape[:-2], 7, measured.shape[-1], unknowns))
@@ -284,6 +286,9 @@ def _with_accelerometer(
         # Gravity has the present calibration in it already, and the linear equations add it.
         twice = _times(design[..., linear:], answer[..., linear:])
         target = np.concatenate([measured, at.excess], axis=-2) + twice
+        if explained is not None:
+            design[..., :6, :, :] = np.einsum("nij,...jnp->...inp", explained, design[..., :6, :, :])
+            target[..., :6, :] = np.einsum("nij,...jn->...in", explained, target[..., :6, :])
         solution = solve(design, target, known, variances)
         moved = np.abs(solution.answer - answer)[..., linear:].max()
         answer, variances = solution.answer, solution.variances

@@ -25,9 +25,7 @@ from bota_ft_compensation.identification.estimation import (
     corrected,
 )
 from bota_ft_compensation.identification.inertia import (
-    PLACES,
     Turned,
-    crossing,
     divided,
     possible_inertia,
     solve_pieces,
@@ -58,6 +56,7 @@ from bota_ft_compensation.quantities import (
     likely_inertia,
 )
 from bota_ft_compensation.stationary import triple
+from bota_ft_compensation.turning import PLACES, crossing, on_places, on_tensors
 
 _ROUNDS: Final = 8
 _LIGHTEST: Final = 1e-3  # kg
@@ -100,10 +99,6 @@ def _imu_covariance() -> Array:
 
 
 _IMU: Final = np.linalg.inv(_imu_covariance())
-_TENSORS: Final = np.zeros((6, 3, 3))  # of each element
-for _number, (_row, _column) in enumerate(PLACES):
-    _TENSORS[_number, _row, _column] = _TENSORS[_number, _column, _row] = 1.0
-_LEVI_CIVITA: Final = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
 
 
 class _Model:
@@ -111,16 +106,11 @@ class _Model:
 
     def __init__(self, turned: Turned, imu: Vector3) -> None:
         self._imu = np.array(imu)
-        self._read = turned.felt + turned.arm @ self._imu
-        even = 0.5 * (turned.arm + turned.arm.transpose(0, 2, 1))
-        trace = np.trace(even, axis1=1, axis2=2)[:, None, None]
-        self._products = even - 0.5 * trace * np.eye(3)  # of the rates
-        odd = 0.5 * (turned.arm - turned.arm.transpose(0, 2, 1))
-        self._spin = np.stack([odd[:, 2, 1], odd[:, 0, 2], odd[:, 1, 0]], axis=1)
-        minutes, self.pieces, spun = divided(turned)
-        # (n, 6), of the tensor's elements: more than noise shows them.
-        self._shown: NDArray[np.bool_] = np.asarray(spun.any(axis=1))
-        still = np.broadcast_to(np.eye(6), (len(spun), 6, 6))
+        self._spin, self._products = turned.spin, turned.products
+        self._read = turned.felt + on_places(self._spin, self._products) @ self._imu
+        # `_shown` (n, 6), of the tensor's elements: more than noise shows them.
+        minutes, self.pieces, self._shown = divided(turned)
+        still = np.broadcast_to(np.eye(6), (len(minutes), 6, 6))
         self._bias = np.concatenate([still, still * minutes], axis=2)
 
     @property
@@ -134,7 +124,7 @@ class _Model:
         right = np.eye(3) - unknowns[_GYROSCOPE].reshape(3, 3)
         spin, products = self._spin @ right.T, right @ self._products @ right.T
         place = self._imu + unknowns[_PLACE]
-        arm, spun = _turning(spin, products)
+        arm, spun = on_places(spin, products), on_tensors(spin, products)
         felt, by_read = corrected(self._read, unknowns[_READ])
         felt = felt - (arm @ place)
         by_place = np.zeros((len(felt), 6, 3))
@@ -144,7 +134,8 @@ class _Model:
             less = np.zeros((3, 3))
             less[row, column] = -1.0
             of_products = less @ self._products @ right.T
-            change, spun_change = _turning(self._spin @ less.T, of_products + of_products.transpose(0, 2, 1))
+            changes = self._spin @ less.T, of_products + of_products.transpose(0, 2, 1)
+            change, spun_change = on_places(*changes), on_tensors(*changes)
             moved = -change @ place
             by_gyroscope[:, :3, number] = -mass * moved - change @ moment
             by_gyroscope[:, 3:, number] = np.cross(moved, moment) - spun_change @ tensor
@@ -157,14 +148,6 @@ class _Model:
         of_tensor = np.concatenate([nothing, -spun], axis=1)
         rows = [of_mass, of_moment, of_tensor, self._bias, of_imu, np.zeros((len(felt), 6, 6))]
         return np.concatenate(rows, axis=2), of_imu @ unknowns[_OF_IMU]
-
-
-def _turning(spin: Array, products: Array) -> tuple[Array, Array]:
-    """As `Turned`: arm and spun, by angular acceleration (n, 3) and products of angular rates (n, 3, 3)."""
-    trace = np.trace(products, axis1=1, axis2=2)[:, None, None]
-    spun = np.einsum("eij,nj->nie", _TENSORS, spin)
-    spun = spun + np.einsum("ijk,njl,elk->nie", _LEVI_CIVITA, products, _TENSORS, optimize=True)
-    return crossing(spin) + products - trace * np.eye(3), spun
 
 
 class _Answer(NamedTuple):
@@ -281,10 +264,10 @@ def _left(found: _Answer, imu: Vector3, bias: slice) -> Six:
     axes = np.eye(3)
     felt = np.concatenate([STANDARD_GRAVITY * axes, -STANDARD_GRAVITY * axes, np.zeros((4, 3))])
     spin = np.concatenate([np.zeros((6, 3)), _SPUN * axes, np.zeros((1, 3))])
-    arm, spun = _turning(spin, np.zeros((10, 3, 3)))
-    felt -= arm @ (found.unknowns[_MOMENT] / found.unknowns[0])
+    products = np.zeros((10, 3, 3))
+    felt -= on_places(spin, products) @ (found.unknowns[_MOMENT] / found.unknowns[0])
     nothing = np.zeros((10, 3))
-    model = _Model(Turned(nothing, nothing, felt, arm, spun, np.arange(10.0)), imu)
+    model = _Model(Turned(nothing, nothing, felt, spin, products, np.arange(10.0)), imu)
     rows = model.at(found.unknowns)[0]
     of_bias = rows[..., _BIAS].copy()
     rows[..., 10:22] = 0.0

@@ -29,11 +29,8 @@ from bota_ft_compensation.identification.resampling import (
     smoothed,
     stretches,
 )
-from bota_ft_compensation.quantities import (
-    ELEMENTS,
-    Accelerometer,
-    CompensationError,
-)
+from bota_ft_compensation.quantities import Accelerometer, CompensationError
+from bota_ft_compensation.turning import PLACES, TENSORS, on_places, on_tensors
 
 _RESPONSES: Final = acceleration_response, angular_rate_response
 _WINDOW_S: Final = 0.05  # of the smoothing; a quarter of it apart are the instants that are compared
@@ -46,7 +43,6 @@ _LEAST_SPIN: Final = 0.3
 _GRAVITY, _GAIN, _CHANCE = (7.0, 13.0), 0.35, 4.0
 _CHANGES: Final = 1.0  # m/s³, rms: with less an offset of the gyroscope would be most of the turning
 _AT_FIRST: Final = 1e6  # weights: what is measured goes first, not what was known before
-PLACES: Final = [("xyz".index(row), "xyz".index(column)) for row, column in ELEMENTS]
 
 
 class Turned(NamedTuple):
@@ -55,8 +51,8 @@ class Turned(NamedTuple):
     force: Array  # (n, 3)
     torque: Array  # (n, 3)
     felt: Array  # (n, 3): specific force at the wrench origin, m/s²
-    arm: Array  # (n, 3, 3): times a place in the sensor's frame, m: by how much it is another there
-    spun: Array  # (n, 3, 6): times the tensor: J alpha + omega x J omega
+    spin: Array  # (n, 3): angular acceleration, rad/s²
+    products: Array  # (n, 3, 3) of angular rates, (rad/s)²
     times: Array  # (n,) s; none where a sample is missing
     # Deviations of noise: of force and torque, of single samples by those of smoothed ones, and of the
     # acceleration of smoothed ones, m/s².
@@ -89,26 +85,29 @@ def turn(
         load, acceleration, rate = np.split(samples[stretch], [6, 9], axis=1)
         load = at_times(times, own, load)
         acceleration, rate = (
-            smoothed(at_times(times - lag_s + delay_s - late[0], own, columns), taps, "full")[: len(times)]
+            at_times(times - lag_s + delay_s - late[0], own, columns)
             for columns, delay_s in zip((acceleration, rate), late, strict=True)
         )
+        # Products of rates pass the FIR filter otherwise than as products of what passes.
+        read = np.hstack([acceleration, rate, (rate[:, :, None] * rate[:, None]).reshape(-1, 9)])
+        passed = smoothed(read, taps, "full")[: len(times)]
+        acceleration, rate, products = np.split(passed, [3, 6], axis=1)
         felt = np.stack(accelerometer.correct(tuple(acceleration.T)), axis=1)
         spin = np.gradient(rate, period, axis=0)
-        arm = crossing(spin) + crossing(rate) @ crossing(rate)
+        arm = on_places(spin, products.reshape(-1, 3, 3))
         moved.append((felt, rate, arm))
-        spun = _elements(spin) + crossing(rate) @ _elements(rate)
-        columns = [load, felt - arm @ np.array(imu), arm.reshape(-1, 9), spun.reshape(-1, 18)]
-        smooth, times = smoothed(np.concatenate(columns, axis=1), window)[::every], times[::every]
+        columns = np.hstack([load, felt - arm @ np.array(imu), spin, products])
+        smooth, times = smoothed(columns, window)[::every], times[::every]
         is_whole = (times > begin_s + reach_s) & (times < end_s - _WINDOW_S)
         found.append(smooth[is_whole])
         instants.append(times[is_whole])
     if not found:
         raise CompensationError("there is a gap in every half second: ethercat-report tells why")
     _check_imu(moved, period)
-    force, torque, felt, arm, spun = np.split(np.concatenate(found), [3, 6, 9, 18], axis=1)
+    force, torque, felt, spin, products = np.split(np.concatenate(found), [3, 6, 9, 12], axis=1)
     times = np.concatenate(instants)
     return Turned(
-        force, torque, felt, arm.reshape(-1, 3, 3), spun.reshape(-1, 3, 6), times,
+        force, torque, felt, spin, products.reshape(-1, 3, 3), times,
         1.0 / float(np.linalg.norm(np.convolve(window, noise_taps(settings)))),
         imu_noise(settings)[0] * float(np.linalg.norm(np.convolve(window, taps))),
     )  # fmt: skip
@@ -154,13 +153,14 @@ def untouched(turned: Turned, beyond: Array, weight: float) -> NDArray[np.bool_]
     return np.asarray(np.convolve(is_touched, np.ones(2 * spread + 1))[spread:-spread] < 0.5)
 
 
-def divided(turned: Turned) -> tuple[Array, NDArray[np.int64], Array]:
-    """Minutes (n, 1, 1), numbers of the pieces (n,), and `spun` where it is more than noise."""
+def divided(turned: Turned) -> tuple[Array, NDArray[np.int64], NDArray[np.bool_]]:
+    """Minutes (n, 1, 1), numbers of the pieces (n,), and (n, 6): whether more than noise shows elements."""
     pieces = np.unique((turned.times / _PIECE_S).astype(int), return_inverse=True)[1]
     squares, lengths = np.zeros((pieces[-1] + 1, 6)), np.maximum(np.bincount(pieces), 1)
-    np.add.at(squares, pieces, (turned.spun**2).sum(axis=1) / lengths[pieces, None])
-    spun = turned.spun * (squares > _LEAST_SPIN**2)[pieces, None]
-    return (turned.times - turned.times.mean())[:, None, None] / 60.0, pieces, spun
+    spun = on_tensors(turned.spin, turned.products)
+    np.add.at(squares, pieces, (spun**2).sum(axis=1) / lengths[pieces, None])
+    is_shown = (squares > _LEAST_SPIN**2)[pieces] & spun.any(axis=1)
+    return (turned.times - turned.times.mean())[:, None, None] / 60.0, pieces, is_shown
 
 
 def solve_pieces(
@@ -200,9 +200,7 @@ def possible_inertia(found: Array, interval: Array) -> Array:
     Half its trace less itself is the second moment of the mass, which is nowhere negative: this is that the
     moments are positive, and none larger than the sum of the others.
     """
-    tensor = np.zeros((3, 3))
-    for (i, j), value in zip(PLACES, found, strict=True):
-        tensor[i, j] = tensor[j, i] = value
+    tensor = np.tensordot(found, TENSORS, 1)
     spread, axes = np.linalg.eigh(0.5 * np.trace(tensor) * np.eye(3) - tensor)
     if spread[0] < -np.linalg.norm(interval):
         moments = ", ".join(f"{moment:.2g}" for moment in np.linalg.eigvalsh(tensor))
@@ -213,20 +211,3 @@ def possible_inertia(found: Array, interval: Array) -> Array:
     spread = np.maximum(spread, 0.0)
     tensor = spread.sum() * np.eye(3) - (axes * spread) @ axes.T
     return np.array([tensor[i, j] for i, j in PLACES])
-
-
-def crossing(vectors: Array) -> Array:
-    """(n, 3, 3): times another vector, this one's cross product with it."""
-    x, y, z = vectors.T
-    nothing = np.zeros_like(x)
-    rows = ((nothing, -z, y), (z, nothing, -x), (-y, x, nothing))
-    return np.moveaxis(np.array(rows), -1, 0)
-
-
-def _elements(vectors: Array) -> Array:
-    """(n, 3, 6): times the elements of a symmetric tensor, that tensor times the vector."""
-    found = np.zeros((len(vectors), 3, 6))
-    for element, (i, j) in enumerate(PLACES):
-        found[:, i, element] = vectors[:, j]
-        found[:, j, element] = vectors[:, i]
-    return found

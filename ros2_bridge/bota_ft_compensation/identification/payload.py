@@ -45,6 +45,7 @@ from bota_ft_compensation.quantities import (
     likely_inertia,
 )
 from bota_ft_compensation.stationary import triple
+from bota_ft_compensation.turning import crossing
 
 LARGEST_MASS: Final = 500.0  # kg: no sensor of the family carries more
 LARGEST_CENTRE: Final = 2.0  # m
@@ -58,7 +59,8 @@ ARM: Final = 0.05  # m: what makes a torque of a force where the center of gravi
 _CHANCE: Final = 0.01  # of seeing drift, or a touch, where there is none
 _SUSPECTS: Final = 12  # poses with the largest residuals
 # What is fitted of the accelerometer: the fewest unknowns whose error of poses that are left out is so near
-# to the least. More would fit errors of the wrench.
+# to the least, of those with which noise explains what is left, if it does with any. More would fit errors of
+# the wrench.
 _MODELS: Final = {
     "offset": calibration_prior(),
     "offset and scale": calibration_prior(scale=True),
@@ -212,7 +214,7 @@ def identify(poses: Sequence[Pose]) -> Identified:
         drift,
         None if touched is None else touched.pose,
         Joint(every.unknowns, every.covariance) if every and every.calibration else None,
-        tuple(np.sqrt((equations.spread**2).mean(axis=0)).tolist()),
+        equations.noise,
     )
     if why := too_vague(payload, mass_interval, gravity):
         raise TooVagueError(f"the poses {why}; {seen.next_pose if touched is None else touched}", result)
@@ -233,7 +235,7 @@ class _Equations:
             np.mean([length(pose.acceleration_spread) ** 2 / 3.0 / pose.samples for pose in poses])
         )
         self.spread = np.array([[*pose.force_spread, *pose.torque_spread] for pose in poses])
-        self._samples = np.array([[pose.samples / pose.alike] for pose in poses])
+        self._samples = _independent(poses)
         times = [pose.time_s for pose in poses if pose.time_s is not None]
         # Minutes before the last pose; None if they say nothing.
         self.minutes: Array | None = None
@@ -242,20 +244,28 @@ class _Equations:
 
         self._is_turned, self._prior = False, FULL_CALIBRATION
 
+    @property
+    def noise(self) -> tuple[float, ...]:
+        """Deviations of single samples; the part that is the mean's lacks in a window."""
+        squares = self.spread**2 / np.maximum(1.0 - 1.0 / self._samples, 0.5)
+        return tuple(np.sqrt(squares.mean(axis=0)).tolist())
+
     def choose(self) -> str:
         """Fit as much of the accelerometer as the poses tell: what that is, for people."""
         count = len(self.wrench)
         if self._acceleration is None or count < _FEWEST_IN_TIME:
             return ""
-        left_out, errors = np.eye(count)[:: math.ceil(count / _LEFT_OUT)], {}
+        left_out, errors, likely = np.eye(count)[:: math.ceil(count / _LEFT_OUT)], dict[str, float](), []
         for name, self._prior in _MODELS.items():
             found = self.solve(left_out)
             assert found.shift is not None
             longer = found.mass.value * (found.excess * left_out).sum(axis=-1, keepdims=True)
             off = np.concatenate([found.shift.value[:, :3], longer], axis=1)
             errors[name] = float(np.median(np.linalg.norm(off, axis=1)))  # whatever touched some of them
-        most = _AS_GOOD * min(errors.values())
-        chosen = next(name for name, error in errors.items() if error <= most)
+            if self.by_noise(self.solve(), np.ones(count, bool), None)[1] is not None:
+                likely.append(name)
+        most = _AS_GOOD * min(errors[name] for name in likely or errors)
+        chosen = next(name for name in likely or errors if errors[name] <= most)
         self._prior = _MODELS[chosen]
         rest = ", ".join(f"{error:.3g} N with {name}" for name, error in errors.items() if name != chosen)
         return f"{chosen} fitted: a pose that is left out is off by {errors[chosen]:.3g} N ({rest})"
@@ -268,19 +278,21 @@ class _Equations:
     def by_noise(
         self, found: Estimate, kept: NDArray[np.bool_], regressor: Array | None
     ) -> tuple[Estimate, Array | None]:
-        """The answer if axes vary by the windows' noise, (6,), which it is too; or what was `found`, None."""
-        # Noise of what is read is the same in force and torque, which count as two measurements of it, as is
-        # right where one of them tells nothing; where both tell the same its variance is twice as large.
-        directions = 1.5 * float(found.mass.value[0]) ** 2 * self._noise * (self._acceleration is not None)
-        arms = np.concatenate([np.ones(3), ((found.center.value**2).sum() - found.center.value**2) / 2])
-        expected = (self.spread**2 / self._samples).mean(axis=0) + directions * arms
-        if not self.spread.all():
+        """The answer if the windows' noise explains it, and `noise` as `estimate` has it; or `found`."""
+        if self._acceleration is None or not self.spread.all():
             return found, None
-        result = self.solve(regressor, expected)
+        # Across gravity noise of what is read turns it: of force and torque together.
+        up = found.gravity / np.linalg.norm(found.gravity, axis=1, keepdims=True)
+        across = float(found.mass.value[0]) * (np.eye(3) - up[:, :, None] * up[:, None])
+        turned = np.concatenate([across, crossing(found.center.value[None]) @ across], axis=1)
+        own = np.diag((self.spread**2 / self._samples).mean(axis=0))
+        noise = np.linalg.inv(np.linalg.cholesky(own + self._noise * turned @ turned.swapaxes(1, 2)))
+        result = self.solve(regressor, noise)
         degrees = max(float(result.degrees.sum()), 1.0)
-        if float((result.residuals[kept] ** 2 / expected).sum()) > degrees * _rarely(degrees):
+        whole = np.einsum("nij,nj->ni", noise, result.residuals)
+        if float((whole[kept] ** 2).sum()) > degrees * _rarely(degrees):
             return found, None
-        return result, expected
+        return result, noise
 
     def solve(self, regressor: Array | None = None, noise: Array | None = None) -> Estimate:
         given = self.wrench, self.gravity, self._acceleration, self._noise, regressor
@@ -455,13 +467,19 @@ def _rarely(degrees: float) -> float:
     return (1.0 - ninth + _RARE * math.sqrt(ninth)) ** 3
 
 
+def _independent(poses: Sequence[Pose]) -> Array:
+    """(n, 1): as many independent samples would tell as much; how alike they are is a matter of filters."""
+    alike = np.mean([pose.alike for pose in poses])
+    return np.array([[pose.samples / alike] for pose in poses])
+
+
 def judge(poses: Sequence[Pose], residuals: Array, degrees: Array, name: str, weight: float) -> Fit:
     """How `residuals` (n, 3) of "force" or "torque" fit; `weight` in N, or Nm at its arm."""
     freedom, rms = max(float(degrees.sum()), 1.0), _residual(residuals, degrees)
     spread = np.array([getattr(pose, f"{name}_spread") for pose in poses])
     chi_square = None
     if spread.all():
-        expected = spread**2 / np.array([[pose.samples / pose.alike] for pose in poses])
+        expected = spread**2 / _independent(poses)
         chi_square = float((residuals**2 / expected).sum()) / freedom
         if chi_square <= _rarely(freedom):
             return Fit(rms, freedom, chi_square, "noise")

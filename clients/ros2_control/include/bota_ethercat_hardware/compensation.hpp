@@ -86,7 +86,7 @@ struct Alignment {
     /// Force and torque are `lag_s` later than the accelerometer (none: unknown), the gyroscope `gyroscope_s`.
     Alignment(std::optional<double> lag_s, double gyroscope_s, bool fir, double rate_hz) : period_s(1.0 / rate_hz) {
         const double at_s = lag_s.value_or(0.0), late = std::max(at_s, 0.0) * rate_hz;
-        const bool whole = fir && lag_s;  // the IMU passes the FIR filter, too
+        whole = fir && lag_s;
         lead = 1 + static_cast<int>(late) + (whole ? 2 : 0);
         gap_s = std::max(whole ? 0.015 : 0.008, 2.5 / rate_hz);
         const auto counted = [&](double history_s) {
@@ -99,15 +99,18 @@ struct Alignment {
         lead = std::min(lead + std::max(1, static_cast<int>(std::ceil(0.004 * rate_hz))), count);
         taps = {lag_s ? fitted(10.0, 9.0, 3, acceleration_noise, std::max(at_s, -kFurthest), counted(0.014), false) : Taps{1.0}, turned(false), turned(true)};
         felt_noise = acceleration_noise * norm(taps[0]), spin_noise = rate_noise * norm(taps[2]), spin_error = fir ? 0.0 : 0.006;
+        tare_noise = acceleration_noise * std::sqrt(period_s);
         Taps passed{1.0};
         if (fir) passed = fir_taps();
         for (std::size_t i = 0; i < 2; ++i) noise_ratios[i] = norm(passed) * std::pow(51200.0 / rate_hz / 51.0, i == 0 ? -0.62 : -0.78);
     }
 
     double period_s, gap_s;  ///< samples further apart than `gap_s` do not belong together
+    bool whole;                    ///< the IMU passes the FIR filter, too, and so do products of its rates
     int lead;                      ///< this many samples are needed after a gap to tell the instant of force and torque
     std::array<Taps, 3> taps;      ///< to acceleration, angular rate and angular acceleration
     double felt_noise, spin_noise;           ///< deviations that the IMU's noise makes on each axis, m/s^2 and rad/s^2
+    double tare_noise;                       ///< as `felt_noise`, of the mean of a second
     double spin_error;                       ///< what this leaves of angular accelerations, as a share of them
     std::array<double, 2> noise_ratios{};    ///< of force and of torque, to those at SINC 51 with FIR off
 
@@ -191,7 +194,8 @@ public:
         const auto& [xx, yy, zz, xy, xz, yz] = tool.inertia;
         const std::array<Vector3, 3> tensor{{{xx, xy, xz}, {xy, yy, yz}, {xz, yz, zz}}};
         const double mass = tool.mass, weight = square(mass / kNormal), at_arm = 2.0 / 3.0 * sum(tool.center), levers = sum(lever);
-        const double arm = mass * bota_ethercat::detail::dot(tool.center, lever), felt = 3.0 * square(mass * alignment.felt_noise);
+        const double arm = mass * bota_ethercat::detail::dot(tool.center, lever), tare_noise = tared ? alignment.tare_noise : 0.0;
+        const double felt = 3.0 * mass * mass * (square(alignment.felt_noise) + square(tare_noise));
         Vector3 forces{}, torques{};  // squared, of an angular acceleration about each axis
         for (std::size_t i = 0; i < 3; ++i) {
             forces[i] = mass * mass * (levers - square(lever[i]));
@@ -279,15 +283,27 @@ public:
         if (!sample.imu_is_finite()) time_s_ = kNever;
         if (!sample.imu_is_finite() || sample.acceleration == Vector3{}) return none();
         const Vector3 &a = sample.acceleration, &w = sample.angular_rate;
-        append({a[0], a[1], a[2], w[0], w[1], w[2]}, time_s - time_s_);
+        Row row{a[0], a[1], a[2], w[0], w[1], w[2]};
+        if (alignment_.whole) {
+            const Products own = products(turning(w));
+            std::copy(own.begin(), own.end(), row.begin() + 6);
+        }
+        append(row, time_s - time_s_);
         time_s_ = time_s;
         if (known_ < alignment_.lead && (moved_ || turns(ring_[at_])) && lever_ != Vector3{}) return none();
         const auto [s, omega, alpha] = aligned();
-        const Vector3 tangential = vector_product(alpha, lever_), centripetal = vector_product(omega, vector_product(omega, lever_));
+        const auto [wxx, wyy, wzz, wxy, wxz, wyz] = alignment_.whole ? aligned_products() : products(omega);
+        const auto& [x, y, z] = lever_;
+        const auto& [xx, yy, zz, xy, xz, yz] = payload_.inertia;
+        const Vector3 tangential = vector_product(alpha, lever_);
+        const Vector3 centripetal{wxy * y + wxz * z - (wyy + wzz) * x, wxy * x + wyz * z - (wxx + wzz) * y, wxz * x + wyz * y - (wxx + wyy) * z};
         Vector3 force{};
         for (std::size_t i = 0; i < 3; ++i) force[i] = -payload_.mass * (s[i] + tangential[i] + centripetal[i]);
         Vector3 torque = vector_product(payload_.center, force);
-        const Vector3 spun = inertia(alpha), turned = vector_product(omega, inertia(omega));
+        const Vector3 spun{xx * alpha[0] + xy * alpha[1] + xz * alpha[2], xy * alpha[0] + yy * alpha[1] + yz * alpha[2],
+                           xz * alpha[0] + yz * alpha[1] + zz * alpha[2]};
+        const Vector3 turned{xz * wxy - xy * wxz + yz * (wyy - wzz) + (zz - yy) * wyz, xy * wyz - yz * wxy + xz * (wzz - wxx) + (xx - zz) * wxz,
+                             yz * wxz - xz * wyz + xy * (wxx - wyy) + (yy - xx) * wxy};
         for (std::size_t i = 0; i < 3; ++i) torque[i] -= spun[i] + turned[i];
         return {force[0], force[1], force[2], torque[0], torque[1], torque[2]};
     }
@@ -296,7 +312,9 @@ public:
     Bounds bounds(bool tared, const std::optional<Vector3>& at = {}) const { return {payload_, lever_, alignment_, tared, at}; }
 
 private:
-    using Row = std::array<double, 6>;  // acceleration and angular rate as read: corrected once aligned, which is linear
+    // Acceleration and angular rate as read, corrected once aligned, which is linear; and products of rates, if they are aligned.
+    using Row = std::array<double, 12>;
+    using Products = std::array<double, 6>;  // of angular rates: xx yy zz xy xz yz
     static constexpr double kNever = -1e18;  // s; infinity is nothing that -ffast-math knows
 
     static bool turns(const Row& row) noexcept {
@@ -313,9 +331,15 @@ private:
 
     static Wrench none() noexcept { return {NAN, NAN, NAN, NAN, NAN, NAN}; }
 
-    Vector3 inertia(const Vector3& v) const noexcept {
-        const auto& [xx, yy, zz, xy, xz, yz] = payload_.inertia;
-        return {xx * v[0] + xy * v[1] + xz * v[2], xy * v[0] + yy * v[1] + yz * v[2], xz * v[0] + yz * v[1] + zz * v[2]};
+    static Products products(const Vector3& w) noexcept {
+        return {w[0] * w[0], w[1] * w[1], w[2] * w[2], w[0] * w[1], w[0] * w[2], w[1] * w[2]};
+    }
+
+    Products aligned_products() const noexcept {
+        Products found{};
+        for (std::size_t k = 0; k < alignment_.taps[1].size(); ++k)
+            for (std::size_t i = 0; i < found.size(); ++i) found[i] += alignment_.taps[1][k] * ring_[at_ + k][6 + i];
+        return found;
     }
 
     Vector3 corrected(Vector3 a) const noexcept {
@@ -343,7 +367,7 @@ private:
         const Row before = ring_[at_];
         for (int lost = 1; lost < periods; ++lost) {
             Row between = row;
-            for (std::size_t i = 0; i < 6; ++i) between[i] = before[i] + (row[i] - before[i]) * lost / periods;
+            for (std::size_t i = 0; i < row.size(); ++i) between[i] = before[i] + (row[i] - before[i]) * lost / periods;
             push(between);
         }
         push(row);
@@ -362,13 +386,13 @@ private:
         const double middle = 0.5 * static_cast<double>(known - 1), squares = static_cast<double>(known * (known * known - 1)) / 12.0;
         Row mean{}, slope{};  // of the slope the sign is that of greater ages
         for (std::size_t k = 0; k < known; ++k)
-            for (std::size_t i = 0; i < 6; ++i) {
+            for (std::size_t i = 0; i < slope.size(); ++i) {
                 mean[i] += ring_[at_ + k][i] / static_cast<double>(known);
                 slope[i] += ring_[at_ + k][i] * (static_cast<double>(k) - middle) / squares;
             }
         for (std::size_t k = known; k < count_; ++k) {
             Row& then = ring_[(at_ + k) % count_];
-            for (std::size_t i = 0; i < 6; ++i) then[i] = mean[i] + slope[i] * (static_cast<double>(k) - middle);
+            for (std::size_t i = 0; i < slope.size(); ++i) then[i] = mean[i] + slope[i] * (static_cast<double>(k) - middle);
             ring_[(at_ + k) % count_ + count_] = then;
         }
     }
