@@ -354,4 +354,5 @@ def test_the_lever_of_the_imu_is_that_of_the_model_or_as_given(
         for w, d in zip(rate, lever, strict=True)
     ]
     assert found == pytest.approx([1.0 + outward[0], 2.0 + outward[1], 9.0 + outward[2]])
-    assert source.follow((0.0, 0.0, 0.0), rate, 0.05) is None, "it is off"
+    off = sample(acceleration=(0.0, 0.0, 0.0), angular_rate=rate)
+    assert source.specific_force(off, 0.05, 0.0) is None
