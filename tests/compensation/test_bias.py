@@ -330,8 +330,9 @@ def test_why_a_sample_may_not_be_used() -> None:
         stream.use_saturated = use_saturated
         assert [stream.why_not(each) for each in (sample(), hot, saturated)] == ["", "", told]
         assert stream.why_not(broken) == faulty
-    stream.plan = Plan(payload=TOOL)
-    assert stream.why_not(saturated) == "", "the IMU is not needed"
+    for plan in (Plan(payload=TOOL), Plan(ImuSource())):
+        stream.plan = plan
+        assert stream.why_not(saturated) == "", "the IMU is not needed"
     stream.forbidden = "for a reason"
     stream.check()
     assert stream.why_not(sample()) == "for a reason"
