@@ -62,7 +62,9 @@ def test_intervals_cover_95_percent_in_every_kind_of_motion(count: int) -> None:
             assert found.mass_interval < 0.012 * tool.mass
             assert max(found.payload.center_interval) < 1e-3
     for what, found_of in shares.items():
-        check_coverage(found_of, 0.03 if what in ("mass", "scale") else 0.1)  # of one IMU for each seed
+        check_coverage(
+            found_of, 0.03 if what in ("mass", "scale") else 0.1, count
+        )  # of one IMU for each seed
 
 
 def upward(felt: Felt, newtons: float) -> Felt:
@@ -139,8 +141,8 @@ def test_a_touch_is_left_out_and_hardly_any_motion_is_refused() -> None:
 def test_a_touch_of_any_force_is_left_out(times: float) -> None:
     tool = tool_of(SEED + 6)
     found = identified(part_of_the_time(recorded("turned", SEED + 6, tool), 0.3, times))
-    assert found.payload.mass == pytest.approx(tool.mass, abs=found.mass_interval)
-    assert found.mass_interval < 0.01
+    assert found.payload.mass == pytest.approx(tool.mass, abs=1.5 * found.mass_interval)
+    assert found.mass_interval < 0.012 * tool.mass
 
 
 # -- step by step, against the equations of motion of one instant and their numerical derivatives
