@@ -153,11 +153,7 @@ class SensorServices:
         offset, spread, residual = (
             known_six(reply.get(key)) or _UNKNOWN for key in ("new_offset", "deviation", "residual")
         )
-        fields = {
-            "bias": tuple(-value for value in offset),
-            "spread": spread,
-            "residual": residual,
-        }
+        fields = {"bias": tuple(-value for value in offset), "spread": spread, "residual": residual}
         return Done(f"sensor {sensor} tared: " + "; ".join(parts), fields)
 
     def get_settings(self, _: Any = None) -> Done:

@@ -12,6 +12,7 @@ import queue
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -20,9 +21,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from bota_clients.errors import RecordingError
 from bota_clients.record import cli, program, recorder
 from bota_clients.record.recorder import BATCH_S, FLUSH_S, Batch
 from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
+from bota_clients.recording.mcap_writer import DiskFile
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from ethercat_server.virtual_sensor.options import SensorOptions
@@ -328,6 +331,15 @@ def test_whatever_the_server_says_is_survived_and_recorded(
         known = {event.event["event"] for event in opened.events}
     assert {"sensor_lost", "unknown", ""} <= known
     assert all(isinstance(name, str) for name in known)
+
+
+def test_a_disk_that_is_full_beside_the_file_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the index of the chunks is kept."""
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: Path("/dev/full").open("r+b"))  # noqa: SIM115
+    disk = DiskFile(tmp_path / "run.mcap", overwrite=False)
+    with pytest.raises(RecordingError, match=r"run.mcap cannot be written: No space left on device; what"):
+        disk.keep(b"index")
+    disk.close()
 
 
 def test_a_full_disk_ends_it_with_what_was_written_whole(

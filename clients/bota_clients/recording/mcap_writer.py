@@ -99,6 +99,7 @@ class DiskFile:
         """Hold for the end of the file, in another one without a name; RecordingError."""
         try:
             self._kept.write(data)
+            self._kept.flush()
         except OSError as error:
             raise self._failed(error, self._left) from None
 
@@ -136,7 +137,8 @@ class DiskFile:
 
     def close(self) -> None:
         """Close the file; what is buffered is discarded."""
-        self._kept.close()
+        with contextlib.suppress(OSError):  # it tries once more to write what a full disk did not take
+            self._kept.close()
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
