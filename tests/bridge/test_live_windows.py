@@ -13,8 +13,11 @@ from bota_clients.export.live import LiveWindows
 from bota_clients.export.windows import Arrays, Windows, read_tool
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.client import Client
+from bota_ethercat.client.session import Item
 from bota_ethercat.framing import DataMessage, encode_data, encode_json
 from bota_ft_compensation.identification.parameter_file import write_payload
+from ethercat_server.simulation.server import MemoryChannel, Simulation
+from ethercat_server.virtual_sensor.options import SensorOptions
 from tests.bridge.scripted_server import MemoryServer, ScriptedChannel
 from tests.bridge.test_one_stream import recorded
 from tests.compensation.making import BIAS, TOOL
@@ -89,3 +92,32 @@ def test_live_and_recorded_windows_are_equal_to_the_bit(
                     row,
                     (stamps[row] - EPOCH_NS) / 1e9,
                 )
+
+
+def test_it_reads_once_for_what_is_on_its_way_and_waits_no_longer_than_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    server = Simulation(SensorOptions(signal="rest"))
+    with Client(1, channel=MemoryChannel(server)).connect() as client:
+        windows, reads = LiveWindows(client, LENGTH), 0
+
+        def poll_all(timeout_s: float) -> list[Item]:
+            nonlocal reads
+            reads += 1
+            return Client.poll_all(client, timeout_s)
+
+        monkeypatch.setattr(client, "poll_all", poll_all)
+        for number in range(30):
+            server.run(1 / 30)
+            begin_ns, reads = server.clock.monotonic_ns(), 0
+            seen = windows.at(server.clock.time_ns())
+            passed_ns = server.clock.monotonic_ns() - begin_ns
+            assert seen["is_complete"]
+            assert seen["force_torque_valid"].all() or not number
+            assert 0.0 <= seen["force_torque_age"][-1] <= 1.3e-3
+            assert 2_900_000 <= passed_ns <= 4_500_000, "the gyroscope's filter, and a period"
+            assert reads <= 2 or not number
+        server.command("disconnect")
+        begin_ns = server.clock.monotonic_ns()
+        assert not windows.at(server.clock.time_ns(), timeout_s=0.02)["is_complete"]
+        assert 20_000_000 <= server.clock.monotonic_ns() - begin_ns <= 22_000_000
