@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The program `ros2 run bridge client`, on PATH as `bridge-client`: arguments, signals, exit codes.
 
-Exit codes: 0 ended as asked (SIGINT, SIGTERM, supervisor), 1 could not start or failed, 2 wrong arguments or
-parameters, 3 ended as the supervisor asked, but the server refused to shut down. While ROS starts and
-the node is built SIGINT and SIGTERM have their default action, so that nothing of ROS can hold it up.
+Exit codes: 0 ended as asked (SIGINT, SIGTERM, SIGHUP, supervisor), 1 could not start or failed, 2 wrong
+arguments or parameters, 3 ended as the supervisor asked, but the server refused to shut down. While ROS
+starts and the node is built the signals have their default action, so that nothing of ROS can hold it up.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node's own process: environment, stop signals, scheduling, and threads that do not die silently.
 
-Once the node is built SIGINT and SIGTERM are an ordinary call from an ordinary thread. Both are blocked in
-every thread and one thread waits for them. A handler would run only when the main thread next executes
-Python, which it does not while it waits inside ROS for the next message.
+Once the node is built SIGINT, SIGTERM and SIGHUP are an ordinary call from an ordinary thread. All are
+blocked in every thread and one thread waits for them. A handler would run only when the main thread next
+executes Python, which it does not while it waits inside ROS for the next message.
 
 The stream's thread gets `rt_priority` and `cpu`. It takes locks that know no priorities, Python's (GIL) and
 the middleware's: whoever holds one while another program has its CPU delays the stream, beside endless loops
@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from bota_ethercat.option_types import integer
+from bota_ethercat.program.signals import asking
 
-STOP_SIGNALS: Final = frozenset({signal.SIGINT, signal.SIGTERM})
 _REPEATED_SIGNAL_S: Final = 1.0
 _HIGHEST_DOMAIN: Final = 232  # of DDS: the ports of others are too high
 STREAM: Final = "reader"
@@ -80,20 +80,21 @@ def refuse(text: str, exit_code: int) -> int:
 
 
 class StopSignals:
-    """SIGINT and SIGTERM from here on; to be made by the main thread before there are others.
+    """What asks the node to end, from here on; to be made by the main thread before there are others.
 
     They wait until `begin`. From there to `call` they have their default action: it ends the process even
     while ROS holds Python's lock.
     """
 
     def __init__(self) -> None:
-        signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)  # in all threads that this one starts, too
+        self._numbers = asking()
+        signal.pthread_sigmask(signal.SIG_BLOCK, self._numbers)  # in all threads that this one starts, too
         self._call: Callable[[signal.Signals], object] = lambda _: None
         self._has_call = threading.Event()
 
     def begin(self) -> bool:
         """All is loaded, and ROS begins; False if a signal has come already."""
-        if signal.sigtimedwait(STOP_SIGNALS, 0) is not None:
+        if signal.sigtimedwait(self._numbers, 0) is not None:
             return False
         threading.Thread(target=self._wait, name="signals", daemon=True).start()
         return True
@@ -108,13 +109,13 @@ class StopSignals:
         self._has_call.set()
 
     def _wait(self) -> None:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, self._numbers)
         self._has_call.wait()
-        signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
-        self._call(signal.Signals(signal.sigwait(STOP_SIGNALS)))
+        signal.pthread_sigmask(signal.SIG_BLOCK, self._numbers)
+        self._call(signal.Signals(signal.sigwait(self._numbers)))
         impatient_s = time.monotonic() + _REPEATED_SIGNAL_S
         while True:
-            number = signal.sigwait(STOP_SIGNALS)
+            number = signal.sigwait(self._numbers)
             if time.monotonic() >= impatient_s:
                 os._exit(128 + number)
 

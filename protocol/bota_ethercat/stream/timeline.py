@@ -130,7 +130,7 @@ class Timeline:
         changed = []
         for now in found:
             was = self[now.sensor]
-            if now.epoch == was.epoch and now.is_other_stream(was):
+            if now.is_other_stream(was):
                 now = now._replace(epoch=was.epoch + 1)  # noqa: PLW2901
             if now != self._now.get(now.sensor):
                 self._now[now.sensor] = now
