@@ -25,13 +25,10 @@ _RATE_HZ: Final = 800
 _FLUSHED: Final = 320  # frames, every 0.4 s
 _ROUNDS: Final = 3
 _COLUMNS: Final = """
-from bota_clients.recording import columns, reader
+from bota_clients.recording import reader
 BEGIN
 with reader.open_recording(Path(given)) as recording:
-    if hasattr(recording, "columns"):
-        recording.columns(0)
-    else:
-        columns.columns(recording.frames(0))"""
+    recording.columns(0)"""
 _PEERS: Final = {  # by package
     "mcap": """
 from mcap.reader import make_reader
