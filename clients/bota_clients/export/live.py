@@ -13,13 +13,15 @@ to the sensor's own offset marks the same samples if the server says so beforeha
 
 from __future__ import annotations
 
+import itertools
 import threading
+from collections import deque
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from bota_clients.export.windows import Arrays, Rows, Windows, read_tool
+from bota_clients.export.windows import Arrays, Windows, read_tool
 from bota_clients.recording.columns import columns
 from bota_clients.recording.order import TimeAxis
 from bota_ethercat.client import Client
@@ -29,7 +31,6 @@ from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.stream.timeline import InForce
 
 _KEEP_S: Final = 1.0
-_STAMPS: Final = np.dtype([("stamp_ns", "i8"), ("monotonic_ns", "i8")])
 
 
 class LiveWindows:
@@ -59,9 +60,8 @@ class LiveWindows:
         self._axis, self._keep_ns, self._shift_ns = TimeAxis(), round(keep_s * 1e9), 0
         self._in_force: InForce | None = None
         self._never = threading.Event()
-        self._clocks = Rows(_STAMPS)  # of the samples that are kept, since the clock was set back last
-        # Of the newest sample: stamp, place, and by how much later it arrived, by this machine's clock.
-        self._stamp_ns = self._newest_ns = self._behind_ns = 0
+        self._clocks = deque[tuple[int, int]]()  # stamps and places of the samples that are kept
+        self._behind_ns = 0  # by how much later the newest one arrived, by this machine's clock
 
     def at(
         self, stamp_ns: int | None = None, *, monotonic_ns: int | None = None, timeout_s: float = 0.05
@@ -100,50 +100,43 @@ class LiveWindows:
 
     def _early_ns(self, instant: int, now_ns: int) -> int:
         """How long until the sample arrives that completes the window of an instant, by those before it."""
+        if not self._clocks:
+            return 0
         newest_ns = now_ns - self._behind_ns + self._shift_ns
-        return instant + self._newest_ns - self._windows.until_ns - newest_ns if self._newest_ns else 0
+        return instant + self._clocks[-1][1] - self._windows.until_ns - newest_ns
 
     def _instant(self, stamp_ns: int | None, monotonic_ns: int | None) -> int:
         """On the axis of the windows; -1 if nothing is known."""
         if monotonic_ns is not None:
             return monotonic_ns + self._shift_ns
-        if stamp_ns is None or not self._newest_ns:
+        if stamp_ns is None or not self._clocks:
             return self._windows.until_ns
-        if stamp_ns >= self._stamp_ns:
-            return self._newest_ns + stamp_ns - self._stamp_ns
-        clocks = self._clocks.array
-        behind = int(np.searchsorted(clocks["stamp_ns"], stamp_ns))
-        near: list[tuple[int, int]] = clocks[max(behind - 1, 0) : behind + 1].tolist()
-        (stamp, instant), (later, then) = near[0], near[-1]
-        return instant + round((stamp_ns - stamp) * ((then - instant) / (later - stamp) if behind else 1.0))
+        later, then = self._clocks[-1]
+        for stamp, instant in reversed(self._clocks):
+            if later > stamp_ns >= stamp:
+                return instant + round((stamp_ns - stamp) * ((then - instant) / (later - stamp)))
+            if stamp_ns > stamp or stamp > later:  # it is newer, or before it the clock was set back
+                break
+            later, then = stamp, instant
+        return then + stamp_ns - later
 
     def _take(self, items: list[Item]) -> None:
-        frames = list[DataMessage]()
-        for item in [*items, None]:
-            if isinstance(item, DataMessage):
-                if item.sensor == self._sensor:
-                    frames.append(item)
-                continue
-            if frames:
-                self._add(frames)
-                frames = []
-            if isinstance(item, InForce) and item.sensor == self._sensor:
-                self._in_force = item
+        for are_frames, some in itertools.groupby(items, lambda item: isinstance(item, DataMessage)):
+            own: list[Any] = [each for each in some if getattr(each, "sensor", None) == self._sensor]
+            if own and are_frames:
+                self._add(own)
+            elif own:
+                self._in_force = own[-1]
 
     def _add(self, frames: list[DataMessage]) -> None:
         arrived = self._in_force or self._client.session.timeline[self._sensor], columns(frames, self._units)
         for in_force, batch in self._axis.batches([arrived]):
             self._windows.configure(in_force)
             new = self._windows.add(batch)
-            rows = np.empty(len(new), _STAMPS)
-            rows["stamp_ns"], rows["monotonic_ns"] = new.stamp_ns, new.monotonic_ns
-            self._clocks.add(rows)
-            latest = self._clocks.array[-len(new) - 1 :]["stamp_ns"]
-            if len(back := np.flatnonzero(latest[1:] < latest[:-1])):  # before, the same times were
-                self._clocks.take(len(self._clocks) - len(latest) + int(back[-1]) + 1)
-        self._shift_ns, clocks = self._axis.shift_ns, self._clocks.array["monotonic_ns"]
-        self._stamp_ns, self._newest_ns = self._clocks.array[-1].tolist() if len(clocks) else (0, 0)
+            self._clocks.extend(zip(new.stamp_ns.tolist(), new.monotonic_ns.tolist(), strict=True))
+        self._shift_ns, clocks = self._axis.shift_ns, self._clocks
         oldest_ns = self._windows.until_ns - self._keep_ns
-        if len(clocks) and clocks[0] <= oldest_ns - self._keep_ns // 2:  # now and then is enough
+        if clocks and clocks[0][1] <= oldest_ns - self._keep_ns // 2:  # now and then is enough
             self._windows.forget(oldest_ns)
-            self._clocks.take(max(int(np.searchsorted(clocks, oldest_ns)) - 1, 0))
+            while len(clocks) > 1 and clocks[1][1] < oldest_ns:
+                clocks.popleft()
