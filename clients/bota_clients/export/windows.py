@@ -197,7 +197,8 @@ class Windows:
         slots["measured_ns"] = samples.monotonic_ns[:, np.newaxis] - self._delay_ns
         slots["number"] = np.arange(self._taken, self._taken + len(slots))
         self._taken += len(slots)
-        values = np.hstack([samples.force, samples.torque, samples.acceleration, samples.angular_rate])
+        vectors = samples.force, samples.torque, samples.acceleration, samples.angular_rate
+        values = np.concatenate(vectors, axis=1)
         is_finite = np.isfinite(values)
         if not (are_finite := is_finite.all()):
             values[~is_finite] = math.nan
@@ -248,22 +249,19 @@ class Windows:
             ends += (late_ns * (self._rate_hz * 1e-9)).astype(np.int64)
         index = ends[..., np.newaxis] + np.arange(-self._length, 0)  # (channel, f, length)
         is_there = (index >= 0) & (index < len(slots))
-        index = np.minimum(np.maximum(index, 0), len(slots) - 1)
-        channels = np.arange(3)[:, np.newaxis, np.newaxis]
-        valid = slots["valid"][index, channels] & is_there
-        age_s = ((instants_ns[:, np.newaxis] - slots["measured_ns"][index, channels]) * 1e-9).astype(
-            np.float32
-        )
-        age_s[~valid] = math.nan
-        wrench = slots["compensated"][index[0]]
+        seen = slots.take(index, mode="clip")
         for channel, ((name, *_), part) in enumerate(_CHANNELS.items()):
-            values = slots["values"][index[channel], part]
-            values[~valid[channel]] = math.nan
-            found |= {name: values, f"{name}_age": age_s[channel], f"{name}_valid": valid[channel]}
+            rows, age = seen[channel], f"{name}_age"
+            valid = rows["valid"][..., channel] & is_there[channel]
+            age_s = (instants_ns[:, np.newaxis] - rows["measured_ns"][..., channel]) * 1e-9
+            found |= {name: rows["values"][..., part].copy(), age: age_s.astype(np.float32)}
+            found[name][~valid] = found[age][~valid] = math.nan
+            found[f"{name}_valid"] = valid
             if self.stream is not None and not channel:
-                wrench[~valid[0]] = math.nan
+                wrench = rows["compensated"].copy()
+                wrench[~valid] = math.nan
                 found[f"{name}_compensated"] = wrench
-                found[f"{name}_compensated_valid"] = valid[0] & np.isfinite(wrench).all(axis=2)
+                found[f"{name}_compensated_valid"] = np.isfinite(wrench).all(axis=2)
         found["imu"] = np.concatenate([found.pop("acceleration"), found.pop("angular_rate")], axis=2)
         return found
 
