@@ -291,6 +291,8 @@ def test_with_a_tool_the_newest_sample_is_without_it_and_contact_is_told() -> No
             point and pytest.approx(point, abs=1e-4),
         )
         assert problems("monitor", json.loads(json_line(state, 0.0))) == []
+    made.connect(model, description(offset=[0.0] * 6), made.OWN_PEER, START_S)
+    assert only(model, now(120)).compensated is None, "it is the connection's before"
     take(model, *(frame(k, still | {"force.y": math.nan}) for k in range(120, 160)))
     rows = table(model.state(now(160)))
     assert any(

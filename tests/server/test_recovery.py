@@ -10,11 +10,14 @@ from typing import Any
 
 import pytest
 
+from bota_ethercat.control import ErrorCode
+from bota_ethercat.errors import RequestError
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.settings import SettingValue, sampling_rate_hz
 from ethercat_server.ethercat.datagrams import Steps
 from ethercat_server.ethercat.slave import registers as reg
 from ethercat_server.ethercat.wire import PROCESSED_BIT, SHORTEST_FRAME, SOURCE_ADDRESS, Command, build
+from ethercat_server.sensor.undo import Former, or_undone
 from ethercat_server.simulation.machine import Machine
 from ethercat_server.virtual_sensor.options import SensorOptions
 from ethercat_server.virtual_sensor.sensor import Firmware
@@ -381,6 +384,37 @@ def test_three_samples_are_discarded_after_a_return_and_not_shown_as_the_last_go
     stream.silent_at_ns = 0
     stream.recover(period_ns)
     assert stream.silent_at_ns > simulation.clock.now_ns + period_ns, "its first samples may still come"
+
+
+def test_event_times_that_were_trusted_are_tried_again_after_a_return_however_they_fail() -> None:
+    simulation, client = streaming()
+    (stream,) = simulation.streams
+    simulation.run(2.0)
+    assert stream.clock.by_events
+    simulation.command("power cycle 0.1")
+    client.wait_event("sensor_back")
+    assert stream.clock.events is not None
+    assert not stream.clock.by_events
+    assert stream.clock.events.trust.was_trusted
+
+
+@pytest.mark.parametrize("was", [False, True])
+def test_a_change_that_is_undone_leaves_the_doubt_of_one_before(was: bool) -> None:
+    def change() -> Steps[None]:
+        yield from ()
+        raise RequestError(ErrorCode.SENSOR, "no answer")
+
+    def undo() -> Steps[object]:
+        yield from ()
+        assert sensor.change_interrupted, "while it is not done"
+        return None
+
+    simulation, _ = streaming()
+    sensor = simulation.sensors[0]
+    sensor.change_interrupted = was
+    with pytest.raises(RequestError, match=r"no answer; as it was"):
+        next(or_undone(change(), undo, Former("it", "; as it was", "", ""), sensor))
+    assert sensor.change_interrupted is was
 
 
 @pytest.mark.parametrize("most", more_if_long([3], [3, 20]))
