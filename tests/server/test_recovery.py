@@ -390,7 +390,7 @@ def test_event_times_that_were_trusted_are_tried_again_after_a_return_however_th
     simulation, client = streaming()
     (stream,) = simulation.streams
     simulation.run(2.0)
-    assert stream.clock.by_events
+    assert stream.status()["clock"]["stamps"] == "hardware"
     simulation.command("power cycle 0.1")
     client.wait_event("sensor_back")
     assert stream.clock.events is not None
