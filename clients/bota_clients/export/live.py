@@ -21,7 +21,6 @@ import numpy as np
 
 from bota_clients.export.windows import Arrays, Rows, Windows, read_tool
 from bota_clients.recording.columns import columns
-from bota_clients.recording.order import TimeAxis
 from bota_ethercat.client import Client
 from bota_ethercat.client.session import Item
 from bota_ethercat.framing import DataMessage
@@ -56,7 +55,7 @@ class LiveWindows:
         """
         self._client, self._sensor, self._units = client, sensor, imu_units
         self._windows = Windows(length, tool=read_tool(tool) if tool else None, imu_units=imu_units)
-        self._axis, self._keep_ns, self._shift_ns = TimeAxis(), round(keep_s * 1e9), 0
+        self._keep_ns, self._shift_ns = round(keep_s * 1e9), 0
         self._in_force: InForce | None = None
         self._never = threading.Event()
         self._clocks = Rows(_STAMPS)  # of the samples that are kept, since the clock was set back last
@@ -132,16 +131,14 @@ class LiveWindows:
 
     def _add(self, frames: list[DataMessage]) -> None:
         arrived = self._in_force or self._client.session.timeline[self._sensor], columns(frames, self._units)
-        for in_force, batch in self._axis.batches([arrived]):
-            self._windows.configure(in_force)
-            new = self._windows.add(batch)
+        for new in self._windows.follow([arrived]):
             rows = np.empty(len(new), _STAMPS)
             rows["stamp_ns"], rows["monotonic_ns"] = new.stamp_ns, new.monotonic_ns
             self._clocks.add(rows)
             latest = self._clocks.array[-len(new) - 1 :]["stamp_ns"]
             if len(back := np.flatnonzero(latest[1:] < latest[:-1])):  # before, the same times were
                 self._clocks.take(len(self._clocks) - len(latest) + int(back[-1]) + 1)
-        self._shift_ns, clocks = self._axis.shift_ns, self._clocks.array["monotonic_ns"]
+        self._shift_ns, clocks = self._windows.axis.shift_ns, self._clocks.array["monotonic_ns"]
         self._stamp_ns, self._newest_ns = self._clocks.array[-1].tolist() if len(clocks) else (0, 0)
         oldest_ns = self._windows.until_ns - self._keep_ns
         if len(clocks) and clocks[0] <= oldest_ns - self._keep_ns // 2:  # now and then is enough
