@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 
+from bota_clients.recording.file_format import RecordedDescription
 from bota_clients.recording.mcap_writer import DiskFile
 from bota_clients.recording.writer import RecordingWriter
 from bota_ethercat.framing import DataMessage
@@ -82,7 +83,7 @@ def make(path: Path, minutes: float) -> int:
     writer = RecordingWriter(DiskFile(path, overwrite=True), "benchmark", {})
     settings = {**start_up_defaults(), "sinc_length": 64}
     row = {"sensor": 0, "name": "BFT-SENS-ECAT-M8", "serial": 1, "rate_hz": _RATE_HZ, "settings": settings}
-    writer.describe(0, {"reply": "describe", "ok": True, "protocol": 1, "sensors": [row]})
+    writer.note(RecordedDescription(0, {"reply": "describe", "ok": True, "protocol": 1, "sensors": [row]}))
     for frame in frames(minutes):
         writer.frame(frame)
         if writer.frames % _FLUSHED == 0:

@@ -16,7 +16,7 @@ from bota_clients.export.windows import Windows
 from bota_clients.monitor.compensated import NewestCompensated
 from bota_clients.monitor.model import Model
 from bota_clients.monitor.reader import MonitorReader
-from bota_clients.recording.file_format import RecordedDescription
+from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
 from bota_clients.recording.mcap_writer import DiskFile
 from bota_clients.recording.reader import open_recording
 from bota_clients.recording.writer import RecordingWriter
@@ -27,6 +27,7 @@ from bota_ethercat.address import Address
 from bota_ethercat.client import Client
 from bota_ethercat.framing import DataMessage, encode_data, encode_json
 from bota_ethercat.pdo import ImuUnits
+from bota_ethercat.text.json_text import JsonObject
 from bota_ft_compensation.identification.parameter_file import write_payload
 from tests.bridge.scripted_server import MemoryServer, ScriptedChannel, ScriptedServer
 from tests.bridge.simulated_node import STEP_S, Node, Server, Stages, six, stamp_ns
@@ -81,18 +82,20 @@ def client(stream: Stream, _: Path) -> Iterator[tuple[int, Found]]:
 def recorded(stream: Stream, path: Path) -> Path:
     """As the recorder writes it."""
     writer = RecordingWriter(DiskFile(path, overwrite=True), "test", {})
-    noted = {"event": "connected", "source": "recorder"}
-    writer.event(EPOCH_NS, noted)
-    writer.describe(EPOCH_NS, stream.begin)
+
+    def note(at_ns: int, *notes: JsonObject) -> None:
+        for each in notes:
+            writer.note((RecordedEvent if "event" in each else RecordedDescription)(EPOCH_NS + at_ns, each))
+
+    noted: JsonObject = {"event": "connected", "source": "recorder"}
+    note(0, noted, stream.begin)
     for at_ns, item in stream.items:
         if isinstance(item, DataMessage):
             writer.frame(item)
         elif isinstance(item, End):
-            writer.event(EPOCH_NS + at_ns, {"event": "disconnected", "source": "recorder", "reason": "?"})
-            writer.event(EPOCH_NS + at_ns, noted)
-            writer.describe(EPOCH_NS + at_ns, item.description)
+            note(at_ns, noted | {"event": "disconnected", "reason": "?"}, noted, item.description)
         else:
-            (writer.event if "event" in item else writer.describe)(EPOCH_NS + at_ns, item)
+            note(at_ns, item)
     writer.finish({})
     return path
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from itertools import chain
 from pathlib import Path
 
+from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
 from bota_clients.recording.mcap_writer import DiskFile
 from bota_clients.recording.writer import RecordingWriter
 from bota_ethercat import pdo
@@ -46,7 +47,7 @@ def write(
     made, now_ns, frames = RecordingWriter(disk, "test", notes), START_NS, 0
     for item in items:
         if not isinstance(item, DataMessage):
-            (made.event if "event" in item else made.describe)(now_ns, item)
+            made.note((RecordedEvent if "event" in item else RecordedDescription)(now_ns, item))
             continue
         made.frame(item)
         now_ns, frames = item.stamp_ns, frames + 1

@@ -262,9 +262,8 @@ def with_fewer_in_index(data: bytes, draw: random.Random) -> bytes:
 def test_what_is_no_frame_of_the_sensor_is_an_error_wherever_it_is(path: Path, name: str, size: int) -> None:
     record(path, [frame(number, size=size, sensor=3) for number in range(5)], sensors=(3,))
     with open_recording(path) as recording:
-        ((_, *parts),) = [[*recording._parts(recording._channels(3))]]
-        ((rows, sensors),) = cast("list[tuple[Any, Any]]", parts)
-        rows = rows.copy()
+        _, rows, _ = cast("tuple[Any, Any, None]", [*recording._parts(3)])
+        rows, sensors = rows.copy(), recording._of
     if not name:
         assert table_of([rows[:2], rows[2:]], sensors)["sequence"].tolist() == [0, 1, 2, 3, 4]
         return

@@ -309,7 +309,7 @@ def test_a_fault_of_its_own_is_no_success(
     def fail(*_: object) -> None:
         raise LookupError("of the writer")
 
-    monkeypatch.setattr("bota_clients.recording.writer.RecordingWriter.describe", fail)
+    monkeypatch.setattr("bota_clients.recording.writer.RecordingWriter.note", fail)
     monkeypatch.setattr(threading, "excepthook", lambda _: None)
     code, said = run(out, "--server", endless.port)
     assert code == 1

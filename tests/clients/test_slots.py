@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from bota_clients.errors import RecordingError
-from bota_clients.export.csv_table import VECTORS
+from bota_clients.export.csv_table import AXES
 from bota_clients.export.samples import samples_of
 from bota_clients.export.windows import Windows
 from bota_clients.recording.columns import columns
@@ -247,10 +247,9 @@ def test_rows_are_the_slots_with_the_stamps_of_the_wall_clock_between(tmp_path: 
             rows.append([*[math.nan] * 13, False, False, 0, 0, *six, False])
         if not rows[-1][13]:
             rows[-1][17:23] = [math.nan] * 6
-    axes = [f"{name}_{axis}_{unit}" for name, unit in VECTORS for axis in "xyz"]
-    names = [*axes, "temperature_degC", "valid", "gap", "status", "warnings"]
+    names = [*AXES, "temperature_degC", "valid", "gap", "status", "warnings"]
     if seed % 2:
-        names += [*(f"compensated_{name}" for name in axes[:6]), "compensated_valid"]
+        names += [*(f"compensated_{name}" for name in AXES[:6]), "compensated_valid"]
         assert np.isfinite(made["compensated_force_bound_N"]).tolist() == made["valid"].tolist()
     for name, column in zip(names, zip(*rows, strict=True), strict=False):
         assert made[name].astype(float) == pytest.approx(np.array(column, float), rel=1e-6, nan_ok=True), name

@@ -38,12 +38,7 @@ from bota_clients.recording.order import TimeAxis, in_order
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.sensor.response import angular_rate_response
 from bota_ft_compensation.identification.delay import lowest
-from bota_ft_compensation.identification.resampling import (
-    at_times,
-    hann_window,
-    resampled,
-    smoothed,
-)
+from bota_ft_compensation.identification.resampling import at_times, hann_window, resampled, smoothed
 
 Array = npt.NDArray[np.float64]
 _SMOOTH_S: Final = 0.1
@@ -242,11 +237,8 @@ def _robot_rates(path: Path, topic: str, urdf: Path | None, link: str) -> tuple[
         raise RecordingError(
             f"the messages of {topic} in {path}{which} are too few, or not in the order of their stamps"
         )
-    times, values, left_out = (
-        times[kept],
-        np.array(rows).reshape(len(times), -1)[kept],
-        left_out + int((~kept).sum()),
-    )
+    values = np.array(rows).reshape(len(times), -1)[kept]
+    times, left_out = times[kept], left_out + int((~kept).sum())
     if not joints:
         return times, values, left_out
     ends = [(begin, begin + _AT_ONCE + 1) for begin in range(0, len(times) - 1, _AT_ONCE)]

@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple
 
 from bota_clients.errors import NothingAskedForError, RecordingError
 from bota_clients.export.cli import PROGRAM
-from bota_clients.export.dataset import about, arrow_of, in_chunks, parquet_writer, windows_for
+from bota_clients.export.dataset import about, arrow_of, in_chunks, windows_for, write_parquet
 from bota_clients.export.samples import MOST_LOST, in_part, samples_of
 from bota_clients.export.windows import read_tool
 from bota_clients.identify.program import choose
@@ -55,7 +55,7 @@ def tables_of(options: argparse.Namespace, recording: Recording, sensor: int | N
 
     chosen = choose(recording, sensor)
     windows = windows_for(options, recording, chosen, MOST_LOST)
-    said = json.dumps(about(options, recording, chosen, tool=windows.tool), default=str)
+    said = about(options, recording, chosen, windows.tool)
     blocks = in_part(recording, windows, samples_of(recording, windows, chosen.sensor))
     for block in in_chunks(blocks, _GROUP):
         rows = arrow_of(block, said)
@@ -112,10 +112,7 @@ def add(path: Path, options: argparse.Namespace, unfinished: str) -> Done:
                 made.append(Path(f"serial={serial}", f"day={day}", name))
                 # No name that data/**/*.parquet finds, if this process is killed.
                 target = Path(beside, str(len(made)))
-                with parquet_writer(target, first.schema, {_SOURCE: source}) as writer:
-                    for table in itertools.chain([first], tables):
-                        writer.write_table(table)
-                        rows += len(table)
+                rows += write_parquet(target, itertools.chain([first], tables), {_SOURCE: source})
             for number, each in enumerate(made, 1):
                 (folder / each).parent.mkdir(parents=True, exist_ok=True)
                 Path(beside, str(number)).replace(folder / each)

@@ -10,51 +10,29 @@ import numpy as np
 
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
-from bota_clients.recording.columns import REGISTERS, Bools, Columns, Ints, Table
+from bota_clients.recording.columns import REGISTERS, Columns, Ints, NewSamples, Table, Whole
 from bota_clients.recording.order import TimeAxis
 from bota_clients.recording.reader import Recording
-from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.program.new_file import NewFile
 
 _SECOND: Final = 1_000_000_000
 _BEGIN: Final = 100  # frames
-VECTORS: Final = (("force", "N"), ("torque", "Nm"), ("acceleration", "m_s2"), ("angular_rate", "rad_s"))
+VECTORS: Final = {"force": "N", "torque": "Nm", "acceleration": "m_s2", "angular_rate": "rad_s"}
+AXES: Final = [f"{name}_{axis}_{unit}" for name, unit in VECTORS.items() for axis in "xyz"]
 _FLAGS: Final = (DataFlag.GAP, DataFlag.REPEATED, DataFlag.INVALID)
 COLUMNS: Final = (
     "time_s", "stamp_utc", "sensor", "sequence",
-    *(f"{name}_{axis}_{unit}" for name, unit in VECTORS for axis in "xyz"),
+    *AXES,
     "temperature_degC",
     *(f"orientation_{axis}" for axis in "xyzw"),
     *(str(flag.name).lower() for flag in _FLAGS),
     *REGISTERS,
 )  # fmt: skip
-_GAP: Final = int(DataFlag.GAP)
 # Nine digits keep a REAL32 to the bit.
 _ORIENTATION: Final = ",".join(["%.9g"] * 4)
 _WHOLE: Final = ["%d"] * (len(_FLAGS) + len(REGISTERS))
 _LINE: Final = ",".join(["%.9f,%sZ,%d,%d", *["%.9g"] * 13, "%s", *_WHOLE]) + "\n"
-
-
-class NewSamples:
-    """Finds the frames that are new and valid samples; a GAP of others is also the next sample's."""
-
-    def __init__(self) -> None:
-        self._gaps = set[int]()  # sensors that had one since their latest sample
-
-    def among(self, flags: Ints, sensor: int) -> tuple[Bools, Ints]:
-        """(n,) which of the next frames of a sensor are, and the flags of all with those GAPs."""
-        is_new, is_gap = (flags & NOT_NEW) == 0, (flags & _GAP) != 0
-        if is_new.all() and sensor not in self._gaps:
-            return is_new, flags
-        gaps = np.append(int(sensor in self._gaps), is_gap).cumsum()
-        at = np.flatnonzero(is_new)
-        told, found = gaps[at + 1], flags.copy()
-        found[at[np.diff(told, prepend=0) > 0]] |= _GAP
-        self._gaps.discard(sensor)
-        if gaps[-1] > told[-1:].max(initial=0):
-            self._gaps.add(sensor)
-        return is_new, found
 
 
 def write(options: argparse.Namespace, recording: Recording) -> str:
@@ -68,20 +46,20 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
         file.write(",".join(COLUMNS) + "\n")
         tables = recording.tables(options.sensor, is_whole=True)
         for table in (each for each in tables if isinstance(each, np.ndarray)):
-            flags, is_kept = table["flags"].astype(np.int64), np.ones(len(table), bool)
-            if not options.all:
-                for sensor in np.unique(table["sensor"]).tolist():
-                    own = table["sensor"] == sensor
-                    is_kept[own], flags[own] = new.among(flags[own], sensor)
-            kept = table if is_kept.all() else table[is_kept]
+            sensors = [] if options.all else np.unique(table["sensor"]).tolist()
+            flags, is_kept = table["flags"].copy(), np.ones(len(table), bool)
+            for sensor in sensors:
+                own = table["sensor"] == sensor
+                is_kept[own], flags[own] = new.among(flags[own], sensor)
+            kept, flags = table[is_kept], flags[is_kept]
             found = Columns.of(kept, options.imu_units)
             if first_ns < 0 and len(found):  # of several sensors another's may be the earliest
                 moments = found.monotonic_ns[:_BEGIN]
                 first_ns = int(moments[moments > moments[0] - _SECOND].min())
-            places, flags = axis.places(found.monotonic_ns, found.stamp_ns), flags[is_kept]
+            places = axis.places(found.monotonic_ns, found.stamp_ns)
             held = recording.asked.holds(found.stamp_ns, places - first_ns)
             is_later = np.ones(len(kept), bool)
-            for sensor in () if options.all else np.unique(kept["sensor"]).tolist():
+            for sensor in sensors:
                 own = kept["sensor"] == sensor
                 is_later[own] = axis.is_later(places[own], sensor)
             strays, held = strays + int((held & ~is_later).sum()), held & is_later
@@ -89,14 +67,13 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
             file.write("".join(written))
             rows += int(held.sum())
         file.finish()
-    frames = sum(there.values()) if options.sensor is None else there[options.sensor]
-    left_out = frames - rows - strays
+    left_out = sum(there[each] for each in there if options.sensor in (None, each)) - rows - strays
     left = f"; {count(left_out, 'frame')} without a new sample left out" if left_out > 0 else ""
     return "; ".join([f"{count(rows, 'sample')}{left}", *axis.said])
 
 
-def _lines(table: Table, samples: Columns, flags: Ints, places: Ints, first_ns: int) -> Iterator[str]:
-    reals = np.column_stack([*(getattr(samples, name) for name, _ in VECTORS), samples.temperature])
+def _lines(table: Table, samples: Columns, flags: Whole, places: Ints, first_ns: int) -> Iterator[str]:
+    reals = np.column_stack([*(getattr(samples, name) for name in VECTORS), samples.temperature])
     turned = ["," * 3] * len(samples)
     for row in np.flatnonzero(~np.isnan(samples.orientation).all(axis=1)).tolist():
         turned[row] = _ORIENTATION % (*samples.orientation[row].tolist(),)

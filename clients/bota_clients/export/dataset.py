@@ -37,6 +37,7 @@ from bota_clients.export.windows import Arrays, Windows, interpolated, read_tool
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.columns import REGISTERS, Ints
+from bota_clients.recording.mcap_writer import moved_to
 from bota_clients.recording.order import TimeAxis, in_order, longest_order
 from bota_clients.recording.reader import RecordedSensor, Recording, Since
 from bota_ethercat.errors import BadMessageError, FileError
@@ -89,6 +90,8 @@ class ForeignClock(NamedTuple):
 
 class Periodic:
     """Frames at a rate, from the first sample on until the last; none in pauses of more than a second."""
+
+    said: Sequence[str] = ()
 
     def __init__(self, fps: float) -> None:
         self._period_ns, self._begin_ns = _SECOND / fps, -1
@@ -208,6 +211,16 @@ class Stamped:
         if self.strict or (np.diff(left, prepend=stamp_ns) < 0).any() or (left > stamp_ns + _NEAR_NS).any():
             left = left[:0]
         return np.stack([left, left - stamp_ns + instant_ns - self._latency_ns])
+
+    @property
+    def said(self) -> list[str]:
+        """What is not as it should be, in clauses."""
+        outside = (
+            f"those of {self.outside} of {count(self.count, 'frame')} are not valid: the frames are before "
+            "or after the recording (--strict refuses them)"
+        )
+        left_out = f"{count(self.left_out, 'frame')} left out, not later than the row before"
+        return [outside] * bool(self.outside) + [left_out] * bool(self.left_out)
 
     def refusal(self, row: int, begin_ns: int, end_ns: int) -> RecordingError:
         """Of this row, which was not exposed between these two stamps, or is not in its place."""
@@ -377,27 +390,20 @@ def _refuse_two_definitions(path: Path, chosen: Any, connections: Iterable[Any])
 
 
 def windows_of(
-    recording: Recording,
-    frames: Periodic | Stamped,
-    windows: Windows,
-    sensor: int = 0,
-    axis: TimeAxis | None = None,
+    recording: Recording, frames: Periodic | Stamped, windows: Windows, sensor: int = 0
 ) -> Iterator[Arrays]:
     """Blocks of f frames: `stamp_ns` as given, `monotonic_ns` of the exposure, and their `Windows.at`.
 
-    On `axis`, by default a new one. RecordingError for a frame that has no place among the samples and is not
-    merely before or after them.
+    RecordingError for a frame that has no place among the samples and is not merely before or after them.
     """
     stamped, outside = frames if isinstance(frames, Stamped) else None, 0
     if stamped is not None:
         stamped.begin(recording, sensor)
     done, first, clocks, waiting = 0, *(np.zeros((2, 0), np.int64) for _ in range(3))
-    batches = (axis or TimeAxis()).batches(recording.batches(sensor, windows.imu_units, is_whole=True))
-    for in_force, batch in itertools.chain(batches, [(None, None)]):
+    batches = recording.batches(sensor, windows.imu_units, is_whole=True)
+    for samples in itertools.chain(windows.follow(batches), [None]):
         until_ns = windows.until_ns
-        if in_force is not None and batch is not None:
-            windows.configure(in_force)
-            samples = windows.add(batch)
+        if samples is not None:
             clocks = np.hstack([clocks[:, -1:], (samples.stamp_ns, samples.monotonic_ns)])
             if clocks.size:
                 waiting = np.hstack([waiting, frames.exposed(*clocks)])
@@ -457,49 +463,36 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     if options.at is not None:
         stamps = read_stamps(options.at, options.column)
         frames = Stamped(stamps, str(options.at), options.latency, clock, strict=options.strict)
-    axis, windows = TimeAxis(), windows_for(options, recording, sensor, length if frames else MOST_LOST)
-    said = json.dumps(about(options, recording, sensor, tool=windows.tool, clock=clock), default=str)
+    windows = windows_for(options, recording, sensor, length if frames else MOST_LOST)
+    said = about(options, recording, sensor, windows.tool, clock)
     if path.exists() and not (options.force and (path.is_file() or (path / "zarr.json").exists())):
         raise FileError(f"{path} {EXISTS}")
-    with tempfile.TemporaryDirectory(
-        prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
-    ) as folder:
-        made, tally = Path(folder, path.name), Counter[bool]()
+    tally = Counter[bool]()
+    with moved_to(path) as made:
         if frames:
-            blocks = windows_of(recording, frames, windows, sensor.sensor, axis)
+            blocks = in_part(recording, windows, windows_of(recording, frames, windows, sensor.sensor))
         else:
-            blocks = samples_of(recording, windows, sensor.sensor, axis)
-        blocks = in_chunks(in_part(recording, windows, blocks), _CHUNK if frames else _GROUP)
-        if not frames:
+            blocks = in_part(recording, windows, samples_of(recording, windows, sensor.sensor))
             blocks = _tallied(blocks, tally)
+        blocks = in_chunks(blocks, _CHUNK if frames else _GROUP)
         _WRITERS[options.suffix](made, said, blocks)
         if path.is_dir():
             shutil.rmtree(path)
-        made.replace(path)
-    remarks = axis.said
     if not frames:
-        remarks.insert(0, f"{count(tally.total(), 'sample')}, {tally[False]} of them not valid")
-        return "; ".join(remarks)
-    if isinstance(frames, Stamped) and frames.outside:
-        remarks.append(
-            f"those of {frames.outside} of {count(frames.count, 'frame')} are not valid: the frames are "
-            "before or after the recording (--strict refuses them)"
-        )
-    if isinstance(frames, Stamped) and frames.left_out:
-        remarks.append(f"{count(frames.left_out, 'frame')} left out, not later than the row before")
-    return "; ".join([f"windows of {count(length, 'sample')}", *remarks])
+        rows = f"{count(tally.total(), 'sample')}, {tally[False]} of them not valid"
+        return "; ".join([rows, *windows.axis.said])
+    return "; ".join([f"windows of {count(length, 'sample')}", *windows.axis.said, *frames.said])
 
 
 def about(
     options: argparse.Namespace,
     recording: Recording,
     sensor: RecordedSensor,
-    *,
     tool: Mapping[str, Any] | None,
     clock: ForeignClock | None = None,
-) -> dict[str, Any]:
-    """The attributes of a file."""
-    return {
+) -> str:
+    """The attributes of a file, JSON."""
+    found = {
         "program": f"{PROGRAM} {VERSION}",
         "options": vars(options) | {"imu_units": options.imu_units.value},
         "recording": recording.metadata,
@@ -517,6 +510,7 @@ def about(
         "clock": clock and clock._asdict(),
         "tool": tool,
     }  # fmt: skip
+    return json.dumps(found, default=str)
 
 
 def _tallied(blocks: Iterable[Arrays], tally: Counter[bool]) -> Iterator[Arrays]:
@@ -565,13 +559,7 @@ def _as_one(blocks: Sequence[Arrays]) -> Arrays:
 
 def _parquet(path: Path, about: str, blocks: Iterable[Arrays]) -> None:
     """One row for each frame or sample; a window is a fixed-size list, sample by sample."""
-
-    writer: Any = None
-    for block in blocks:
-        table = arrow_of(block, about)
-        writer = writer or parquet_writer(path, table.schema)
-        writer.write_table(table)
-    writer.close()
+    write_parquet(path, (arrow_of(block, about) for block in blocks))
 
 
 def arrow_of(block: Arrays, about: str) -> Any:
@@ -589,17 +577,22 @@ def arrow_of(block: Arrays, about: str) -> Any:
     return pa.table(columns, metadata={ATTRIBUTES: about})
 
 
-def parquet_writer(path: Path, schema: Any, more: Mapping[str, str] = {}) -> Any:
-    """For tables of this schema, with more metadata."""
+def write_parquet(path: Path, tables: Iterator[Any], more: Mapping[str, str] = {}) -> int:
+    """Write tables of one schema, with more metadata; how many rows."""
     from pyarrow import parquet  # noqa: PLC0415 - of the extra `dataset`
 
-    is_samples = "valid" in schema.names
+    first, rows = next(tables), 0
+    schema, is_samples = first.schema, "valid" in first.schema.names
     # A dictionary of measured numbers costs most of the time and saves nothing.
     few = [name for name in (*REGISTERS, "recording") if name in schema.names]
-    return parquet.ParquetWriter(
+    with parquet.ParquetWriter(
         path, schema.with_metadata({**schema.metadata, **more}),
         compression="snappy" if is_samples else "zstd", use_dictionary=few if is_samples else True,
-    )  # fmt: skip
+    ) as writer:  # fmt: skip
+        for table in itertools.chain([first], tables):
+            writer.write_table(table)
+            rows += len(table)
+    return rows
 
 
 def _npz(path: Path, about: str, blocks: Iterable[Arrays]) -> None:

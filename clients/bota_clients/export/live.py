@@ -23,7 +23,6 @@ import numpy as np
 
 from bota_clients.export.windows import Arrays, Windows, read_tool
 from bota_clients.recording.columns import columns
-from bota_clients.recording.order import TimeAxis
 from bota_ethercat.client import Client
 from bota_ethercat.client.session import Item
 from bota_ethercat.framing import DataMessage
@@ -57,7 +56,7 @@ class LiveWindows:
         """
         self._client, self._sensor, self._units = client, sensor, imu_units
         self._windows = Windows(length, tool=read_tool(tool) if tool else None, imu_units=imu_units)
-        self._axis, self._keep_ns, self._shift_ns = TimeAxis(), round(keep_s * 1e9), 0
+        self._axis, self._keep_ns = self._windows.axis, round(keep_s * 1e9)
         self._in_force: InForce | None = None
         self._never = threading.Event()
         self._clocks = deque[tuple[int, int]]()  # stamps and places of the samples that are kept
@@ -94,7 +93,7 @@ class LiveWindows:
                     break
         found = windows.at(np.array([instant]), is_partial=True)
         return {name: array[0] for name, array in found.items()} | {
-            "monotonic_ns": np.array(instant - self._shift_ns),
+            "monotonic_ns": np.array(instant - self._axis.shift_ns),
             "is_complete": np.array(0 <= instant <= windows.until_ns),
         }
 
@@ -102,13 +101,13 @@ class LiveWindows:
         """How long until the sample arrives that completes the window of an instant, by those before it."""
         if not self._clocks:
             return 0
-        newest_ns = now_ns - self._behind_ns + self._shift_ns
+        newest_ns = now_ns - self._behind_ns + self._axis.shift_ns
         return instant + self._clocks[-1][1] - self._windows.until_ns - newest_ns
 
     def _instant(self, stamp_ns: int | None, monotonic_ns: int | None) -> int:
         """On the axis of the windows; -1 if nothing is known."""
         if monotonic_ns is not None:
-            return monotonic_ns + self._shift_ns
+            return monotonic_ns + self._axis.shift_ns
         if stamp_ns is None or not self._clocks:
             return self._windows.until_ns
         later, then = self._clocks[-1]
@@ -130,12 +129,9 @@ class LiveWindows:
 
     def _add(self, frames: list[DataMessage]) -> None:
         arrived = self._in_force or self._client.session.timeline[self._sensor], columns(frames, self._units)
-        for in_force, batch in self._axis.batches([arrived]):
-            self._windows.configure(in_force)
-            new = self._windows.add(batch)
+        for new in self._windows.follow([arrived]):
             self._clocks.extend(zip(new.stamp_ns.tolist(), new.monotonic_ns.tolist(), strict=True))
-        self._shift_ns, clocks = self._axis.shift_ns, self._clocks
-        oldest_ns = self._windows.until_ns - self._keep_ns
+        clocks, oldest_ns = self._clocks, self._windows.until_ns - self._keep_ns
         if clocks and clocks[0][1] <= oldest_ns - self._keep_ns // 2:  # now and then is enough
             self._windows.forget(oldest_ns)
             while len(clocks) > 1 and clocks[1][1] < oldest_ns:

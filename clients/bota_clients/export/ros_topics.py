@@ -16,22 +16,18 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from bota_clients.export.cli import PROGRAM
+from bota_clients.export.csv_table import AXES
 from bota_clients.export.dataset import windows_for
 from bota_clients.export.samples import MOST_LOST, in_part, samples_of
 from bota_clients.export.windows import Arrays
 from bota_clients.identify.program import choose
 from bota_clients.numbers import count
 from bota_clients.recording.mcap_writer import McapWriter, message_rows, whole_file
-from bota_clients.recording.order import TimeAxis
 from bota_clients.recording.reader import Recording
 from bota_ethercat.program.version import VERSION
 
 _STORE: Final[Any] = get_typestore(Stores.ROS2_JAZZY)
 _STAMP: Final = slice(4, 12)  # s and ns, behind the bytes that say CDR, little-endian
-
-
-def _named(prefix: str, unit: str) -> list[str]:
-    return [f"{prefix}_{axis}_{unit}" for axis in "xyz"]
 
 
 class Topic(NamedTuple):
@@ -57,15 +53,12 @@ class Topic(NamedTuple):
 _WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 _IMU: Final = "sensor_msgs/msg/Imu"
 TOPICS: Final = (
-    Topic("wrench", _WRENCH, "ft_sensor", range(6), _named("force", "N") + _named("torque", "Nm")),
+    Topic("wrench", _WRENCH, "ft_sensor", range(6), AXES[:6]),
     Topic(
-        "wrench_compensated", _WRENCH, "ft_sensor", range(6),
-        _named("compensated_force", "N") + _named("compensated_torque", "Nm"), "compensated_valid",
+        "wrench_compensated", _WRENCH, "ft_sensor", range(6), [f"compensated_{each}" for each in AXES[:6]],
+        "compensated_valid",
     ),
-    Topic(
-        "imu/data_raw", _IMU, "ft_sensor_imu", (13, 14, 15, 25, 26, 27),
-        _named("angular_rate", "rad_s") + _named("acceleration", "m_s2"),
-    ),
+    Topic("imu/data_raw", _IMU, "ft_sensor_imu", (13, 14, 15, 25, 26, 27), AXES[9:] + AXES[6:9]),
     Topic("temperature", "sensor_msgs/msg/Temperature", "ft_sensor", (0,), ["temperature_degC"]),
 )  # fmt: skip
 _NUMBERS: Final = {_WRENCH: 6, _IMU: 37}  # float64 at the end; of others 2
@@ -73,18 +66,20 @@ _NUMBERS: Final = {_WRENCH: 6, _IMU: 37}  # float64 at the end; of others 2
 
 def write(options: argparse.Namespace, recording: Recording) -> str:
     """The topics of a sensor into a file; says how many messages. RecordingError."""
-    sensor, axis = choose(recording, options.sensor), TimeAxis()
+    sensor = choose(recording, options.sensor)
     windows = windows_for(options, recording, sensor, MOST_LOST)
     with whole_file(options.output, force=options.force) as disk:
         writer = McapWriter(disk, "ros2", f"{PROGRAM} {VERSION}")
         wanted = [topic for topic in TOPICS if windows.stream or not topic.valid]
         senders, sent = [_Sender(writer, topic) for topic in wanted], 0
-        for block in in_part(recording, windows, samples_of(recording, windows, sensor.sensor, axis)):
+        for block in in_part(recording, windows, samples_of(recording, windows, sensor.sensor)):
             sent += sum(each.send(block) for each in senders)
             disk.flush()
         writer.finish()
         disk.sync()
-    return "; ".join([f"{count(sent, 'message')} on {', '.join(topic.name for topic in wanted)}", *axis.said])
+    return "; ".join(
+        [f"{count(sent, 'message')} on {', '.join(topic.name for topic in wanted)}", *windows.axis.said]
+    )
 
 
 class _Sender:

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
 from bota_clients.errors import NothingAskedForError, RecordingError
-from bota_clients.export.csv_table import VECTORS, NewSamples
+from bota_clients.export.csv_table import AXES, VECTORS
 from bota_clients.export.windows import Array, Arrays, Windows, interpolated
 from bota_clients.recording.columns import RECORD, REGISTERS, Columns, joined
-from bota_clients.recording.order import TimeAxis
 from bota_clients.recording.reader import Recording
 from bota_ethercat.framing import DataFlag
 
@@ -26,29 +24,24 @@ _STEP_NS: Final = 1_000_000
 _SLEW: Final = 0.001
 
 
-def samples_of(
-    recording: Recording, windows: Windows, sensor: int = 0, axis: TimeAxis | None = None
-) -> Iterator[Arrays]:
+def samples_of(recording: Recording, windows: Windows, sensor: int = 0) -> Iterator[Arrays]:
     """Blocks of rows, with the places and the compensated wrench of `windows`, of a length of `MOST_LOST`.
 
-    On `axis`, by default a new one. RecordingError.
+    RecordingError.
     """
-    batches = (axis or TimeAxis()).batches(recording.batches(sensor, windows.imu_units, is_whole=True))
-    held, new = list[Columns](), NewSamples()
+    batches, held = recording.batches(sensor, windows.imu_units, is_whole=True), Columns.empty(0)
     begin, taken = 0, 0  # samples: number of the first that is held, and how many were taken
-    for in_force, batch in itertools.chain(batches, [(None, None)]):
-        if in_force is not None and batch is not None:
-            windows.configure(in_force)
-            _, flags = new.among(batch.flags, sensor)
-            held = [joined([*held, windows.add(replace(batch, flags=flags))])]
-        slots = windows.take(rest=in_force is None)
+    for samples in itertools.chain(windows.follow(batches), [None]):
+        if samples is not None:
+            held = joined([held, samples])
+        slots = windows.take(rest=samples is None)
         if not len(slots):
             continue
         is_with_tool = windows.stream is not None
-        yield _rows(slots, held[0], slots["number"] - begin, windows.begin_ns, tool=is_with_tool)
+        yield _rows(slots, held, slots["number"] - begin, windows.begin_ns, tool=is_with_tool)
         taken = int(slots["number"].max(initial=taken - 1)) + 1
         keep = max(taken - 1, 0)  # lost samples that follow are between this one and the next
-        held, begin = [held[0].where(slice(keep - begin, None))], keep
+        held, begin = held.where(slice(keep - begin, None)), keep
     if not taken:
         raise RecordingError(f"{recording.path} has no new and valid samples")
 
@@ -81,25 +74,23 @@ def _rows(slots: Array, samples: Columns, index: Array, first_ns: int, *, tool: 
         return np.asarray(values)
 
     monotonic_ns = slots["monotonic_ns"]
-    stamp_ns = interpolated(monotonic_ns, samples.monotonic_ns, samples.stamp_ns)
-    passed, stamped = np.diff(samples.monotonic_ns), np.diff(samples.stamp_ns)
-    is_set = np.append(False, abs(stamped - passed) > _STEP_NS + _SLEW * passed)
-    behind = np.minimum(np.searchsorted(samples.monotonic_ns, monotonic_ns), len(samples) - 1)
-    stamp = np.where(is_lost, stamp_ns, samples.stamp_ns[index]).astype("datetime64[ns]")
-    stamp[is_lost & is_set[behind]] = np.datetime64("NaT")
+    stamp = samples.stamp_ns[index].view("datetime64[ns]")
+    if any_lost:
+        at, here, there = monotonic_ns[is_lost], samples.monotonic_ns, samples.stamp_ns
+        passed, stamped = np.diff(here), np.diff(there)
+        is_set = np.append(False, abs(stamped - passed) > _STEP_NS + _SLEW * passed)
+        stamp[is_lost] = interpolated(at, here, there).view("datetime64[ns]")
+        behind = np.minimum(np.searchsorted(here, monotonic_ns), len(here) - 1)
+        stamp[is_lost & is_set[behind]] = np.datetime64("NaT")
     found: Arrays = {
         "time_s": (monotonic_ns - first_ns) * 1e-9, "stamp_utc": stamp, "monotonic_ns": monotonic_ns,
         "sequence": slots["sequence"], "valid": slots["valid"][:, 0],
     }  # fmt: skip
-    axes = {
-        f"{name}_{axis}_{unit}": (name, place) for name, unit in VECTORS for place, axis in enumerate("xyz")
-    }
-    vectors = {name: column(name).astype(np.float32) for name, _ in VECTORS}
-    found |= {name: vectors[of][:, place] for name, (of, place) in axes.items()}
+    found |= zip(AXES, np.hstack([column(name) for name in VECTORS], dtype=np.float32).T, strict=True)
     if tool:
         wrench = np.where(found["valid"][:, np.newaxis], slots["compensated"], np.nan)
         found["compensated_valid"] = np.asarray(np.isfinite(wrench).all(axis=1))
-        found |= {f"compensated_{name}": part for name, part in zip(axes, wrench.T, strict=False)}
+        found |= {f"compensated_{name}": part for name, part in zip(AXES, wrench.T, strict=False)}
         force, torque = np.where(found["compensated_valid"], slots["bounds"].T, np.nan).astype(np.float32)
         found |= {"compensated_force_bound_N": force, "compensated_torque_bound_Nm": torque}
     found["temperature_degC"] = column("temperature").astype(np.float32)

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import argparse
 
+import numpy as np
+
 from bota_clients.errors import RecordingError
 from bota_clients.export.cli import PROGRAM
 from bota_clients.numbers import count
-from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
 from bota_clients.recording.mcap_writer import whole_file
 from bota_clients.recording.reader import Recording
 from bota_clients.recording.writer import RecordingWriter
@@ -33,12 +34,10 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
     with whole_file(options.output, force=options.force) as disk:
         writer = RecordingWriter(disk, f"{PROGRAM} {VERSION}", notes)
         for item in recording.tables(sensor):
-            if isinstance(item, RecordedDescription):
-                writer.describe(item.stamp_ns, item.reply)
-            elif isinstance(item, RecordedEvent):
-                writer.event(item.stamp_ns, item.event)
-            else:
+            if isinstance(item, np.ndarray):
                 writer.table(item)
+            else:
+                writer.note(item)
             disk.flush()
         writer.finish(recording.end)
     return count(writer.frames, "frame")

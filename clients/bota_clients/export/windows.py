@@ -13,7 +13,8 @@ stamps are ns of the server's CLOCK_MONOTONIC.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,11 +23,13 @@ import numpy.typing as npt
 
 from bota_clients.errors import RecordingError
 from bota_clients.identify.tool_file import tool_parameters
-from bota_clients.recording.columns import Bools, Columns, Ints
+from bota_clients.recording.columns import Bools, Columns, Ints, NewSamples
+from bota_clients.recording.order import TimeAxis
 from bota_ethercat.framing import DataFlag
 from bota_ethercat.pdo import ImuUnits
 from bota_ethercat.replies import Delays
 from bota_ethercat.sensor.response import delays_ms
+from bota_ethercat.settings import SettingValue
 from bota_ethercat.stream.timeline import InForce
 from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE
 from bota_ft_compensation.identification.parameter_file import stream_of
@@ -106,28 +109,30 @@ class Windows:
         until_ns: last instant of which nothing that comes later can be a part; -1 before the first sample.
         tool: parameters of the node; None: there is no compensated wrench.
         stream: what compensates; None without a tool.
+        axis: on which `follow` puts them.
+        doubt_ns: how long before an offset was reported samples may have part of it; 0 without a tool.
     """
 
     def __init__(
-        self,
-        length: int,
-        *,
-        tool: Mapping[str, Any] | None = None,
-        imu_units: ImuUnits = ImuUnits.G_DPS,
+        self, length: int, *, tool: Mapping[str, Any] | None = None, imu_units: ImuUnits = ImuUnits.G_DPS
     ) -> None:
         """Of `length` samples. With a `tool`, parameters of the ROS 2 node, there is a compensated wrench."""
-        self.begin_ns, self.tool = -1, tool
+        self.begin_ns, self.tool, self.axis, self._new = -1, tool, TimeAxis(), NewSamples()
         self._length, self.imu_units = length, imu_units
-        self.stream: CompensatedStream | None = None
         self._slots = Rows(_SLOT)
         self._latest_ns, self.until_ns = np.full(3, -1), -1  # the first by channel: the latest measured
         self._newest = (0, 0)  # stamp and sequence of the newest sample
         self._taken = self._epoch = 0  # samples; of what is in force
         self._begins = False  # another stream, which the first sample after a pause need not say
-        self._made_of: tuple[Mapping[str, object], float] | None = None
-        self._doubt_ns = 0
-        if tool is not None:
-            self.stream = stream_of(tool)
+        self._settings, self._rate_hz = dict[str, SettingValue](), -1.0
+        self.doubt_ns = 0
+        self.stream: CompensatedStream | None = None if tool is None else stream_of(tool)
+
+    def follow(self, batches: Iterable[tuple[InForce, Columns]]) -> Iterator[Columns]:
+        """Take the next batches on one axis of time, each with what is in force; the samples of each."""
+        for in_force, batch in self.axis.batches(batches):
+            self.configure(in_force)
+            yield self.add(batch)
 
     def configure(self, in_force: InForce) -> None:
         """What is in force for what follows; RecordingError.
@@ -139,11 +144,11 @@ class Windows:
         self._begins, self._epoch = self._begins or in_force.epoch != self._epoch, in_force.epoch
         if self.stream is not None:
             self._follow(in_force, self.stream)
-        if (settings, rate_hz) == self._made_of:
+        if (settings, rate_hz) == (self._settings, self._rate_hz):
             return
         if not rate_hz:
             raise RecordingError("the sampling rate is not known, so lost samples have no place")
-        self._made_of, self._known, self._rate_hz = (settings, rate_hz), settings, rate_hz
+        self._settings, self._rate_hz = dict(settings), rate_hz
         # Where a delay is unknown, a sample counts as measured only when it was stamped: never too early.
         self._delay_ns = np.array([delay or 0 for delay in Delays.parse(delays_ms(settings, rate_hz))])
 
@@ -151,24 +156,22 @@ class Windows:
         """What is in force for what follows, the sensor's own offset too."""
         was_announced = stream.offset is None  # of what came since then nothing is compensated
         stream.configure(in_force)
-        self._doubt_ns = in_force.doubt_ns
+        self.doubt_ns = in_force.doubt_ns
         if stream.follow_offset() is None:
             return
-        newest_ns = self._newest[0]
         if self.begin_ns >= 0 and not was_announced:
-            since_ns = newest_ns - self.doubt_ns - self._delay_ns[0]
+            since_ns = self._newest[0] - self.doubt_ns - self._delay_ns[0]
             slots = self._slots.array
             slots["compensated"][slots["measured_ns"][:, 0] >= since_ns] = math.nan
 
-    @property
-    def doubt_ns(self) -> int:
-        """How long before an offset was reported samples may have part of it; 0 without a tool."""
-        return self._doubt_ns
-
     def add(self, frames: Columns) -> Columns:
-        """Take the next frames of the sensor, also REPEATED and INVALID ones; the samples. RecordingError."""
-        is_fresh = frames.fresh
-        samples = frames if is_fresh.all() else frames.where(is_fresh)
+        """Take the next frames of the sensor, also REPEATED and INVALID ones; the samples. RecordingError.
+
+        A GAP of other frames is the next sample's.
+        """
+        is_new, flags = self._new.among(frames.flags)
+        samples = replace(frames, flags=flags)
+        samples = samples if is_new.all() else samples.where(is_new)
         if not len(samples):
             return samples
         stamps, sequence = samples.monotonic_ns, samples.sequence
@@ -206,7 +209,7 @@ class Windows:
         for place, (channel, part) in enumerate(_CHANNELS.items()):
             is_good = channel.flagged(samples) == 0
             slots["valid"][:, place] = is_good if are_finite else is_good & is_finite[:, part].all(axis=1)
-        if self._known.get("imu_active") == 0:
+        if self._settings.get("imu_active") == 0:
             slots["valid"][:, 1:] = False
         slots["compensated"], slots["bounds"] = (
             (math.nan, math.nan) if self.stream is None else self.stream.compensate(samples)
@@ -240,8 +243,7 @@ class Windows:
         """
         if not is_partial and (instants_ns > self.until_ns).any():
             raise ValueError(f"after {self.until_ns} ns not all samples are here: take more")
-        slots, found = self._slots.array, Arrays()
-        ends = np.array([self._ends(instants_ns, channel) for channel in range(3)])
+        slots, found, ends = self._slots.array, Arrays(), self._ends(instants_ns)
         if not len(slots):
             slots = _EMPTY
         elif is_partial:
@@ -267,14 +269,14 @@ class Windows:
 
     def forget(self, before_ns: int) -> None:
         """What windows of this instant and later ones do not need; without this everything is kept."""
-        ends = [int(self._ends(np.array([before_ns]), channel)[0]) for channel in range(3)]
-        self._slots.take(max(min(ends) - self._length, 0))
+        self._slots.take(max(int(self._ends(np.array([before_ns])).min()) - self._length, 0))
 
     def take(self, *, rest: bool) -> Array:
         """The slots that nothing that comes later can change, or the rest; they are in no window then."""
         settled = np.array([self.until_ns - self.doubt_ns - 1])
-        return self._slots.take(len(self._slots) if rest else int(self._ends(settled, 0)[0]))
+        return self._slots.take(len(self._slots) if rest else int(self._ends(settled)[0, 0]))
 
-    def _ends(self, instants_ns: Ints, channel: int) -> Ints:
-        """The slot behind the newest one that was measured before or at each of these instants."""
-        return np.searchsorted(self._slots.array["latest_ns"][:, channel], instants_ns, "right")
+    def _ends(self, instants_ns: Ints) -> Ints:
+        """(3, f) By channel the slot behind the newest that was measured before or at each instant."""
+        latest_ns = self._slots.array["latest_ns"].T
+        return np.array([np.searchsorted(each, instants_ns, "right") for each in latest_ns])

@@ -13,9 +13,11 @@ import queue
 import socket
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -23,7 +25,7 @@ from rich.filesize import decimal
 
 from bota_clients.errors import RecordingError
 from bota_clients.numbers import count
-from bota_clients.recording.file_format import RECORDER, RecordedDescription, RecordedEvent
+from bota_clients.recording.file_format import RECORDER, Note, RecordedDescription, RecordedEvent
 from bota_clients.recording.mcap_writer import DiskFile
 from bota_clients.recording.writer import RecordingWriter
 from bota_ethercat.accounting import StreamAccounting, StreamCounts
@@ -37,7 +39,7 @@ from bota_ethercat.text.json_text import JsonObject
 from bota_ethercat.text.untrusted import printable, rows
 
 NAME: Final = f"ethercat-record {VERSION}"
-Batch = list[DataMessage | RecordedDescription | RecordedEvent]
+Batch = list[DataMessage | Note]
 
 BATCH_S: Final = 0.02  # two sensors at 1600 Hz make 64 frames in this time
 # Bytes that the kernel may buffer, as far as it allows: seconds in which nothing is lost.
@@ -118,7 +120,8 @@ class Recorder:
     def __init__(self, path: Path, library: str, notes: Mapping[str, str], *, overwrite: bool) -> None:
         """Create the file; RecordingError. `notes` become its metadata."""
         self.dropped = self.disconnections = 0
-        self._streams: dict[int, StreamAccounting] = {}  # by position on the bus
+        # By position on the bus.
+        self._streams = defaultdict[int, StreamAccounting](partial(StreamAccounting, fresh_only=False))
         self.error: RecordingError | None = None
         self.saved = 0
         self._queue: queue.SimpleQueue[Batch | None] = queue.SimpleQueue()
@@ -237,38 +240,31 @@ class Recorder:
                 self._writer.flush()
                 self._unflushed = 0
 
-    def _write(self, item: DataMessage | RecordedDescription | RecordedEvent) -> None:
-        writer = self._writer
+    def _write(self, item: DataMessage | Note) -> None:
         if isinstance(item, DataMessage):
             self._unflushed += 1
             self.saved += 1
-            self._stream(item.sensor).count(item.sequence, item.monotonic_ns, item.flags)
-            writer.frame(item)
-        elif isinstance(item, RecordedDescription):
-            writer.describe(item.stamp_ns, item.reply)
+            self._streams[item.sensor].count(item.sequence, item.monotonic_ns, item.flags)
+            self._writer.frame(item)
+            return
+        self._writer.note(item)
+        if isinstance(item, RecordedDescription):
             self._take_rates(rows(item.reply.get("sensors")))
-        else:
-            if item.by_recorder and item.name == "lost":
-                self.dropped += int(item.event["frames"])
-            elif item.by_recorder:  # the server may have been restarted, and its numbering with it
-                self.disconnections += item.name == "disconnected"
-                for stream in self._streams.values():
-                    stream.begin()
-            else:
-                self._take_rates([item.event])
-            writer.event(item.stamp_ns, item.event)
+        elif not item.by_recorder:
+            self._take_rates([item.event])
+        elif item.name == "lost":
+            self.dropped += int(item.event["frames"])
+        else:  # the server may have been restarted, and its numbering with it
+            self.disconnections += item.name == "disconnected"
+            for stream in self._streams.values():
+                stream.begin()
 
     def _take_rates(self, told: Sequence[JsonObject]) -> None:
         """By them the samples that are missing are counted."""
         for row in told:
             if (info := SensorInfo.parse(row)) is not None:
-                stream = self._stream(info.sensor)
+                stream = self._streams[info.sensor]
                 stream.rate_hz = info.rate_hz or stream.rate_hz
-
-    def _stream(self, position: int) -> StreamAccounting:
-        if position not in self._streams:
-            self._streams[position] = StreamAccounting(fresh_only=False)
-        return self._streams[position]
 
     def _finish(self) -> None:
         counts = {at: {"frames": each.frames, **asdict(each)} for at, each in self._counts().items()}

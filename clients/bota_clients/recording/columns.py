@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import math
-import operator
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -15,7 +13,7 @@ import numpy.typing as npt
 from bota_clients.recording import file_format
 from bota_clients.recording.mcap_file import HEAD, HEADS, RECORD_HEAD, Rows
 from bota_ethercat.accounting import NOT_NEW
-from bota_ethercat.framing import DataMessage
+from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import LAYOUTS, STANDARD_GRAVITY, ImuUnits
 
 Floats = npt.NDArray[np.float64]
@@ -25,6 +23,7 @@ Whole = npt.NDArray[Any]  # unsigned integers of the size that they are sent in
 Table = npt.NDArray[np.void]  # (n,) of one of RECORDS
 
 _MAX: Final = (1 << 63) - 1
+_GAP: Final = int(DataFlag.GAP)
 REGISTERS: Final = (
     "force_torque_saturated", "acceleration_saturated", "angular_rate_saturated", "warnings", "status",
 )  # fmt: skip
@@ -54,23 +53,24 @@ def _record(size: int) -> np.dtype[np.void]:
 
 
 RECORDS: Final = {size: _record(size) for size in sorted(LAYOUTS)}
+_SIZES: Final = np.vstack([*LAYOUTS]).astype("<u4")
 RECORD: Final = RECORDS[max(LAYOUTS)]  # the smaller begins alike
 _ARRIVED: Final = np.dtype([*_FRAME, ("process_data", f"V{max(LAYOUTS)}")])  # fields of a `DataMessage`
 _DECODED: Final = np.dtype([*_FRAME, *_fields(max(LAYOUTS))])
 
 
-def table_of(parts: Sequence[Rows], sensors: npt.NDArray[Any]) -> Table:
-    """The frames of these sensors (n,) that are in records; RecordingError at the first that is none."""
+def table_of(parts: Sequence[Rows], of: npt.NDArray[Any]) -> Table:
+    """The frames in these records, `of` which sensor by channel; RecordingError at the first that is none."""
     widest = max(part.shape[1] for part in parts)
     record = next((each for each in RECORDS.values() if each.itemsize >= widest), RECORD)
     width = record.itemsize
     if any(part.shape[1] != width for part in parts):
         parts = [np.pad(part[:, :width], ((0, 0), (0, max(width - part.shape[1], 0)))) for part in parts]
     table: Table = np.frombuffer(b"".join(part.data for part in parts), record)  # copied at once
-    sizes = table["size"]
+    sizes, sensors = table["size"], of.take(table["channel"])
     fits = (table["cdr"] == file_format.CDR_NUMBER) & (table["sensor"] == sensors)
     fits &= table["length"] == sizes + np.uint64(_HEADS)
-    fits &= functools.reduce(operator.or_, [sizes == each for each in LAYOUTS])
+    fits &= (sizes == _SIZES).any(axis=0)
     if not fits.all():
         row = int(fits.argmin())
         length = int(table["length"][row]) - (HEAD - RECORD_HEAD)
@@ -159,3 +159,24 @@ def columns(frames: Iterable[DataMessage], imu_units: ImuUnits = ImuUnits.G_DPS)
 
 def joined(parts: Sequence[Columns]) -> Columns:
     return Columns(*(np.concatenate([getattr(part, name) for part in parts]) for name in Columns.__slots__))
+
+
+class NewSamples:
+    """Finds the frames that are new and valid samples; a GAP of others is also the next sample's."""
+
+    def __init__(self) -> None:
+        self._gaps = set[int]()  # sensors that had one since their latest sample
+
+    def among(self, flags: Whole, sensor: int = 0) -> tuple[Bools, Whole]:
+        """(n,) which of the next frames of a sensor are, and the flags of all with those GAPs."""
+        is_new, is_gap = (flags & NOT_NEW) == 0, (flags & _GAP) != 0
+        if is_new.all() and sensor not in self._gaps:
+            return is_new, flags
+        gaps = np.append(int(sensor in self._gaps), is_gap).cumsum()
+        at = np.flatnonzero(is_new)
+        told, found = gaps[at + 1], flags.copy()
+        found[at[np.diff(told, prepend=0) > 0]] |= _GAP
+        self._gaps.discard(sensor)
+        if gaps[-1] > told[-1:].max(initial=0):
+            self._gaps.add(sensor)
+        return is_new, found

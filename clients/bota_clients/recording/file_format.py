@@ -75,6 +75,9 @@ class RecordedEvent(NamedTuple):
         return self.event.get("source") == RECORDER
 
 
+Note = RecordedDescription | RecordedEvent
+
+
 def frame_topic(sensor: int) -> str:
     """The topic of the frames of the sensor at this position."""
     return f"/ethercat/sensor_{sensor}/frames"

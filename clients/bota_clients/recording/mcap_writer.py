@@ -148,6 +148,17 @@ class DiskFile:
 
 
 @contextlib.contextmanager
+def moved_to(path: Path) -> Iterator[Path]:
+    """A path beside this one for a file or a folder, which is moved here once it is complete."""
+    with tempfile.TemporaryDirectory(
+        prefix=".unfinished-", dir=path.parent, ignore_cleanup_errors=True
+    ) as folder:
+        made = Path(folder, path.name)
+        yield made
+        made.replace(path)
+
+
+@contextlib.contextmanager
 def whole_file(path: Path, *, force: bool) -> Iterator[DiskFile]:
     """A file that is there once it is complete, as `NewFile`; a device is written directly. FileError."""
     refuse_existing(path, force=force)
@@ -155,15 +166,10 @@ def whole_file(path: Path, *, force: bool) -> Iterator[DiskFile]:
         with contextlib.closing(DiskFile(path, overwrite=True)) as disk:
             yield disk
         return
-    target = Path(os.path.realpath(path))  # a symbolic link stays one
-    with tempfile.TemporaryDirectory(
-        prefix=".unfinished-", dir=target.parent, ignore_cleanup_errors=True
-    ) as folder:
-        made = Path(folder, target.name)
+    with moved_to(Path(os.path.realpath(path))) as made:  # a symbolic link stays one
         with contextlib.closing(DiskFile(made, overwrite=False, becomes=path)) as disk:
             yield disk
         refuse_existing(path, force=force)
-        made.replace(target)
 
 
 def _packed(record: records.McapRecord) -> bytes:

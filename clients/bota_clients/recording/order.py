@@ -62,57 +62,44 @@ class TimeAxis:
     def places(self, monotonic_ns: Ints, stamp_ns: Ints) -> Ints:
         """Where the next frames (n,) are, ns."""
         now = np.concatenate([(self._before_ns, self._last_ns), monotonic_ns])
-        back = now[2:] <= now[:-2]
         shifts: Any = self.shift_ns
-        if self._undo or back.any():
-            shifts = self._shifts(now, np.append(self._stamp_ns, stamp_ns), back)
+        if self._undo or ((now[2:] <= now[:-2]) & (now[1:-1] - now[2:] > _SECOND)).any():
+            passed = np.diff(stamp_ns, prepend=self._stamp_ns).tolist()
+            rows = zip(now.tolist(), now[1:].tolist(), monotonic_ns.tolist(), passed, strict=False)
+            shifts = np.array([self._shift(*row) for row in rows], np.int64)
         if len(monotonic_ns):
             self._before_ns, self._last_ns, self._stamp_ns = int(now[-2]), int(now[-1]), int(stamp_ns[-1])
         places: Ints = np.minimum(monotonic_ns, _MAX - shifts) + shifts
         return places
 
-    def _shifts(self, now: Ints, stamps: Ints, back: Bools) -> Ints:
-        """What is added to each of n frames; `now` begins with the two before them, `stamps` with the one."""
-        fell = np.flatnonzero(back & (now[1:-1] - now[2:] > _SECOND)).tolist()
-        events = {row + more for row in fell for more in (0, 1)} | ({0} if self._undo else set())
-        shifts, since = np.zeros(len(back), np.int64), 0
-        for row in sorted(events & {*range(len(back))}):
-            shifts[since:row], since = self.shift_ns, row
-            now_ns, last_ns = int(now[row + 2]), int(now[row + 1])
-            undo, self._undo = self._undo, None
-            if undo and now_ns > undo[0]:  # else the latest one was the stray
-                self.restarts -= 1
-                self.shift_ns = undo[1]
-            elif int(now[row]) >= now_ns < last_ns - _SECOND:
-                self.restarts += 1
-                self._undo = last_ns, self.shift_ns
-                passed_ns = max(_SECOND, int(stamps[row + 1] - stamps[row]))
-                self.shift_ns = min(self.shift_ns + last_ns - now_ns + passed_ns, _MAX)
-        shifts[since:] = self.shift_ns
-        return shifts
+    def _shift(self, before_ns: int, last_ns: int, now_ns: int, passed_ns: int) -> int:
+        """What is added to the next frame, by the two before it and the time passed by CLOCK_REALTIME."""
+        undo, self._undo = self._undo, None
+        if undo and now_ns > undo[0]:  # else the latest one was the stray
+            self.restarts -= 1
+            self.shift_ns = undo[1]
+        elif before_ns >= now_ns < last_ns - _SECOND:
+            self.restarts += 1
+            self._undo = last_ns, self.shift_ns
+            self.shift_ns = min(self.shift_ns + last_ns - now_ns + max(_SECOND, passed_ns), _MAX)
+        return self.shift_ns
 
     def is_later(self, places: Ints, sensor: int = 0) -> Bools:
         """(n,) Which of a sensor's next samples, at these places, come in order; counts the others."""
         newest_ns = self._newest_ns.get(sensor, -1)
-        found = in_order(np.concatenate([(newest_ns,), places]))
-        is_whole, found = found.all(), found[1:]
-        if not is_whole:
-            found &= places > newest_ns
-            self.left_out += int((~found).sum())
-        self._newest_ns[sensor] = int((places if is_whole else places[found])[-1:].max(initial=newest_ns))
+        found: Bools = in_order(np.append(newest_ns, places))[1:] & (places > newest_ns)
+        self.left_out += int((~found).sum())
+        self._newest_ns[sensor] = int(places[found][-1:].max(initial=newest_ns))
         return found
 
     def batches(self, batches: Iterable[tuple[InForce, Columns]]) -> Iterator[tuple[InForce, Columns]]:
         """Those of one sensor with their places as `monotonic_ns`, without samples out of order."""
         for in_force, batch in batches:
-            places, fresh = self.places(batch.monotonic_ns, batch.stamp_ns), batch.fresh
-            found, is_later = replace(batch, monotonic_ns=places), self.is_later(places[fresh])
-            if not is_later.all():
-                is_kept = ~fresh
-                is_kept[fresh] = is_later
-                found = found.where(is_kept)
-            if len(found):
-                yield in_force, found
+            places, is_kept = self.places(batch.monotonic_ns, batch.stamp_ns), ~batch.fresh
+            is_kept[~is_kept] = self.is_later(places[~is_kept])
+            found = replace(batch, monotonic_ns=places)
+            if is_kept.any():
+                yield in_force, found if is_kept.all() else found.where(is_kept)
 
     @property
     def said(self) -> list[str]:

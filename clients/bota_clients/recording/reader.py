@@ -14,17 +14,16 @@ import itertools
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from bota_clients.errors import NothingAskedForError, RecordingError
 from bota_clients.numbers import moment, seconds
 from bota_clients.recording import file_format
 from bota_clients.recording.asked import Asked
 from bota_clients.recording.columns import Columns, Table, frames_of, joined, table_of
-from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
+from bota_clients.recording.file_format import Note, RecordedDescription, RecordedEvent
 from bota_clients.recording.mcap_file import CHANNEL, McapFile, Rows, message_in
 from bota_clients.recording.order import TimeAxis
 from bota_ethercat.framing import DataMessage
@@ -40,9 +39,6 @@ ALL: Final = Asked()
 UNKNOWN: Final = "does not say settings and rate of sensor {}: if need be give --set sinc_length=N, or --rate"
 REWRITTEN: Final = "has no notes of ethercat-record: another program wrote it"
 _LONGEST_CHOICE: Final = 1024  # characters of the list of chosen positions
-
-
-_Part = tuple[Rows, npt.NDArray[Any]] | RecordedDescription | RecordedEvent
 
 
 class Since(NamedTuple):
@@ -67,23 +63,17 @@ class RecordedSensor(NamedTuple):
     @property
     def history(self) -> tuple[Since, ...]:
         """By identity and settings, each as it was known last."""
-        found: list[Since] = []
-        for each in self.changes:
-            same = found and found[-1].info
-            if same and (same.identity, same.settings) == (each.info.identity, each.info.settings):
-                found[-1] = Since(found[-1].stamp_ns, each.in_force)
-            else:
-                found.append(each)
-        return tuple(found)
+        alike = itertools.groupby(self.changes, lambda each: (each.info.identity, each.info.settings))
+        return tuple(Since(same[0].stamp_ns, same[-1].in_force) for same in ([*each] for _, each in alike))
 
     @property
     def offsets(self) -> tuple[Since, ...]:
         """By what the sensor itself adds to every sample (object 0x8000)."""
-        firsts = (next(same) for _, same in itertools.groupby(self.changes, lambda each: each.info.offset))
-        return tuple(firsts)
+        alike = itertools.groupby(self.changes, lambda each: each.info.offset)
+        return tuple(next(same) for _, same in alike)
 
 
-def follow(timeline: Timeline, note: RecordedDescription | RecordedEvent) -> list[InForce]:
+def follow(timeline: Timeline, note: Note) -> list[InForce]:
     """Feed the next description or event of a file; what it changed."""
     if isinstance(note, RecordedDescription):
         return timeline.describe(note.reply)
@@ -115,10 +105,32 @@ class Recording(McapFile):
         super()._open()
         if self.cut_off is not None:
             self.remarks.append(f"was cut off ({self.cut_off}): the intact part is read")
+        # By channel: of which sensor it has frames; _NOTE, or -1: others.
+        self._of, counts = np.full(1 << 16, -1, np.int16), Counter[int]()
+        for number, topic in self.topics.items():
+            if (sensor := file_format.sensor_of_topic(topic)) is not None:
+                self._of[number] = sensor
+                counts[sensor] += self.counts[number]
+            elif topic in (file_format.DESCRIPTION_TOPIC, file_format.EVENTS_TOPIC):
+                self._of[number] = _NOTE
+        self.metadata = self._metadata(is_rewritten=bool(counts))
+        chosen = self.metadata.get("sensors", "")[:_LONGEST_CHOICE].split()
+        self.chosen = {int(position) for position in chosen if position.isascii() and position.isdecimal()}
+        self.end: Mapping[str, str] | None = self.notes.get(file_format.END_METADATA)
+        sensors = self._follow_notes(counts)
+        self.sensors = tuple(map(self._in_part, sensors)) if self.asked.part else sensors
+        self.frame_count = sum(each.frames for each in self.sensors)
+        if self.asked.part and not self.frame_count and any(counts.values()):
+            ends = (item["stamp_ns"][[0, -1]] for item in self._tables(None) if isinstance(item, np.ndarray))
+            stamps = [stamp for each in ends for stamp in each.tolist()] or [0]  # and not all tables
+            begin_ns, end_ns = stamps[0], stamps[-1]
+            long = f"it is {seconds((end_ns - begin_ns) * 1e-9)} long, from {moment(begin_ns)} on"
+            raise NothingAskedForError(f"{self.path} has nothing {self.asked.part}: {long}")
+
+    def _metadata(self, *, is_rewritten: bool) -> Mapping[str, str]:
+        """What the recorder wrote at the start; `is_rewritten`: without it another program wrote the file."""
         found = self.notes.get(file_format.METADATA)
-        if found is None and any(
-            file_format.sensor_of_topic(topic) is not None for topic in self.topics.values()
-        ):
+        if found is None and is_rewritten:
             found = {"format": file_format.FORMAT_VERSION}
             self.remarks.append(REWRITTEN)
         if found is None:
@@ -128,58 +140,37 @@ class Recording(McapFile):
                 f"{self.path} has format {found.get('format', '?')[:20]!r} and this program reads "
                 f"{file_format.FORMAT_VERSION}: use the version that wrote it"
             )
-        self.metadata: Mapping[str, str] = found
-        chosen = found.get("sensors", "")[:_LONGEST_CHOICE].split()
-        self.chosen = {int(position) for position in chosen if position.isascii() and position.isdecimal()}
-        self.end: Mapping[str, str] | None = self.notes.get(file_format.END_METADATA)
-        counts, self._noted, self._sensor_of = Counter[int](), set[int](), dict[int, int]()
-        for number, topic in self.topics.items():
-            if (sensor := file_format.sensor_of_topic(topic)) is not None:
-                self._sensor_of[number] = sensor
-                counts[sensor] += self.counts[number]
-            elif topic in (file_format.DESCRIPTION_TOPIC, file_format.EVENTS_TOPIC):
-                self._noted.add(number)
+        return found
+
+    def _follow_notes(self, counts: Counter[int]) -> tuple[RecordedSensor, ...]:
+        """Take the events; the sensors, of which the file has so many frames."""
         self.events: list[RecordedEvent] = []
         timeline, changes = Timeline(), defaultdict[int, list[Since]](list)
         self._given, told = self.asked.description(counts), dict[int, bool]()  # was it described first?
         for now in timeline.describe(self._given):
             changes[now.sensor].append(Since(0, now))
-        for taken, note in enumerate(self._parts(set())):
+        notes = (item for item in self._tables(_NOTE) if not isinstance(item, np.ndarray))
+        for taken, note in enumerate(notes):
             if taken == _MAX_NOTES:
                 raise RecordingError(f"{self.path} has more than {_MAX_NOTES} events")
-            if not isinstance(note, RecordedDescription | RecordedEvent):
-                continue
             for now in follow(timeline, note):
                 if not isinstance(note, RecordedEvent) or not note.by_recorder:
                     told.setdefault(now.sensor, isinstance(note, RecordedDescription))
                 changes[now.sensor].append(Since(note.stamp_ns, now))
             if isinstance(note, RecordedEvent):
                 self.events.append(note)
-        self.sensors: tuple[RecordedSensor, ...] = tuple(
-            RecordedSensor(
-                position,
-                changes[position][0].info if position in changes else SensorInfo(position),
-                tuple(changes.get(position, ())),
-                counts[position],
-            )
-            for position in sorted(changes.keys() | counts.keys())
-        )
         unsaid = sorted(position for position in +counts if not told.get(position))
         if self._given and not unsaid:
             raise RecordingError(f"{self.path} says settings and rate itself: omit --set and --rate")
         self.remarks += [] if self._given else map(UNKNOWN.format, unsaid)
-        # What a description tells first was in force before it.
-        known = unsaid if self._given else [position for position in told if told[position]]
+        # What a description tells first was in force before it, unless it was given.
+        known = [] if self._given else [position for position in told if told[position]]
         self._begin = {position: changes[position][0].in_force for position in known}
-        if self.asked.part:
-            self.sensors = tuple(map(self._in_part, self.sensors))
-        self.frame_count = sum(each.frames for each in self.sensors)
-        if self.asked.part and not self.frame_count and any(counts.values()):
-            ends = (item["stamp_ns"][[0, -1]] for item in self._tables(None) if isinstance(item, np.ndarray))
-            stamps = [stamp for each in ends for stamp in each.tolist()] or [0]  # and not all tables
-            begin_ns, end_ns = stamps[0], stamps[-1]
-            long = f"it is {seconds((end_ns - begin_ns) * 1e-9)} long, from {moment(begin_ns)} on"
-            raise NothingAskedForError(f"{self.path} has nothing {self.asked.part}: {long}")
+        found = {position: tuple(changes[position]) for position in sorted(changes.keys() | counts.keys())}
+        return tuple(
+            RecordedSensor(position, own[0].info if own else SensorInfo(position), own, counts[position])
+            for position, own in found.items()
+        )
 
     def _in_part(self, sensor: RecordedSensor) -> RecordedSensor:
         """With its frames, and what was in force for them."""
@@ -199,9 +190,7 @@ class Recording(McapFile):
         """
         return (item for item in self.everything(sensor) if isinstance(item, DataMessage))
 
-    def everything(
-        self, sensor: int | None = None
-    ) -> Iterator[DataMessage | RecordedDescription | RecordedEvent]:
+    def everything(self, sensor: int | None = None) -> Iterator[DataMessage | Note]:
         """Descriptions, events and the frames of the sensor at this position, or of all, as they came.
 
         Of a part its frames, and what was told up to the last of them.
@@ -209,9 +198,7 @@ class Recording(McapFile):
         for item in self.tables(sensor):
             yield from frames_of(item) if isinstance(item, np.ndarray) else [item]
 
-    def tables(
-        self, sensor: int | None = None, *, is_whole: bool = False
-    ) -> Iterator[Table | RecordedDescription | RecordedEvent]:
+    def tables(self, sensor: int | None = None, *, is_whole: bool = False) -> Iterator[Table | Note]:
         """As `everything`, with the frames as arrays of a few thousand, which descriptions and events end.
 
         `is_whole`: of all the recording, for what depends on what came before a part.
@@ -219,7 +206,7 @@ class Recording(McapFile):
         if is_whole or not self.asked.part:
             yield from self._tables(sensor)
             return
-        axis, begin_ns, told = TimeAxis(), -1, list[RecordedDescription | RecordedEvent]()
+        axis, begin_ns, told = TimeAxis(), -1, list[Note]()
         for item in self._tables(sensor):
             if not isinstance(item, np.ndarray):
                 told.append(item)
@@ -234,24 +221,22 @@ class Recording(McapFile):
                 told.clear()
                 yield item[held]
 
-    def _tables(self, sensor: int | None) -> Iterator[Table | RecordedDescription | RecordedEvent]:
-        held, sensors, count = list[Rows](), list[npt.NDArray[Any]](), 0
-        for part in self._until_damage(self._channels(sensor)):
-            if part is None or isinstance(part, RecordedDescription | RecordedEvent | RecordingError):
-                if count:
-                    yield table_of(held, np.concatenate(sensors))
-                held, sensors, count = [], [], 0
-                if isinstance(part, RecordingError):
-                    raise part
-                if part is not None:
-                    yield part
+    def _tables(self, sensor: int | None) -> Iterator[Table | Note]:
+        held, count = list[Rows](), 0
+        for part in self._parts(sensor):
+            if isinstance(part, np.ndarray):
+                while count + len(part) >= _BATCH:
+                    yield table_of([*held, part[: _BATCH - count]], self._of)
+                    held, count, part = [], 0, part[_BATCH - count :]  # noqa: PLW2901
+                held, count = [*held, part.copy()], count + len(part)
                 continue
-            rows, of = part
-            while count + len(rows) >= _BATCH:
-                left = _BATCH - count
-                yield table_of([*held, rows[:left]], np.concatenate([*sensors, of[:left]]))
-                held, sensors, count, rows, of = [], [], 0, rows[left:], of[left:]
-            held, sensors, count = [*held, rows.copy()], [*sensors, of], count + len(rows)
+            if count:
+                yield table_of(held, self._of)
+            held, count = [], 0
+            if isinstance(part, RecordingError):
+                raise part
+            if part is not None:
+                yield part
 
     def batches(
         self, sensor: int, imu_units: ImuUnits = ImuUnits.G_DPS, *, is_whole: bool = False
@@ -278,43 +263,35 @@ class Recording(McapFile):
                 count += len(table)
         return found.where(slice(count))
 
-    def _until_damage(self, wanted: set[int]) -> Iterator[_Part | RecordingError | None]:
-        """As `_parts`, and at last what ended it."""
+    def _parts(self, sensor: int | None) -> Iterator[Rows | Note | RecordingError | None]:
+        """Descriptions, events and the records of frames, as they came, and at last what ended them.
+
+        _NOTE: no frames.
+        """
+        sensors, damage = self._of.copy(), None
+        if sensor is not None:
+            sensors[[number for number in self.topics if sensors[number] not in (sensor, _NOTE)]] = -1
         try:
-            yield from self._parts(wanted)
-            yield None
+            for rows in self.rows({number for number in self.topics if sensors[number] >= 0}):
+                channels = rows[:, CHANNEL].tobytes()
+                of, edges = sensors[np.frombuffer(channels, "<u2")], list[int]()
+                if channels != channels[:2] * len(rows):
+                    rows, of = rows[of >= 0], of[of >= 0]  # noqa: PLW2901
+                    edges = (np.flatnonzero(np.diff(of == _NOTE)) + 1).tolist()
+                for begin, end in itertools.pairwise([0, *edges, len(of)]):
+                    if begin < end and of[begin] == _NOTE:
+                        yield from (self._note(*message_in(row)) for row in rows[begin:end])
+                    elif begin < end and of[begin] >= 0:
+                        yield rows[begin:end]
         except RecordingError as error:
-            yield error
+            damage = error
+        yield damage
 
-    def _parts(self, wanted: set[int]) -> Iterator[_Part]:
-        """Records of frames and of what sensors they are to be, descriptions and events."""
-        sensors = np.full(1 << 16, -1, np.int16)  # by channel; of notes _NOTE
-        for channel in wanted:
-            sensors[channel] = self._sensor_of[channel]
-        sensors[[*self._noted]] = _NOTE
-        for rows in self.rows(wanted | self._noted):
-            channels = rows[:, CHANNEL].tobytes()
-            of = sensors[np.frombuffer(channels, "<u2")]
-            edges: Any = []
-            if channels != channels[:2] * len(rows):
-                rows, of = rows[of >= 0], of[of >= 0]  # noqa: PLW2901
-                edges = np.flatnonzero(np.diff(of == _NOTE)) + 1
-            elif of[0] < 0:
-                continue
-            for begin, end in itertools.pairwise([0, *edges, len(of)]):
-                if begin < end and of[begin] != _NOTE:
-                    yield rows[begin:end], of[begin:end]
-                elif begin < end:
-                    yield from (self._note(*message_in(row)) for row in rows[begin:end])
-
-    def _note(self, channel: int, log_time_ns: int, body: memoryview) -> RecordedDescription | RecordedEvent:
+    def _note(self, channel: int, log_time_ns: int, body: memoryview) -> Note:
         topic = self.topics[channel]
         said = file_format.unpack_json(body, topic)
         is_reply = topic == file_format.DESCRIPTION_TOPIC
         return RecordedDescription(log_time_ns, said) if is_reply else RecordedEvent(log_time_ns, said)
-
-    def _channels(self, sensor: int | None) -> set[int]:
-        return {number for number, position in self._sensor_of.items() if sensor in (None, position)}
 
 
 def open_recording(path: Path, asked: Asked = ALL) -> Recording:

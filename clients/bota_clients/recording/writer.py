@@ -13,9 +13,9 @@ import numpy as np
 
 from bota_clients.recording import file_format
 from bota_clients.recording.columns import Table
+from bota_clients.recording.file_format import Note, RecordedDescription
 from bota_clients.recording.mcap_writer import DiskFile, McapWriter
 from bota_ethercat.framing import DataMessage
-from bota_ethercat.text.json_text import JsonObject
 
 _U32: Final = 0xFFFFFFFF
 
@@ -38,14 +38,14 @@ class RecordingWriter:
         self._notes = 0
         self._frame_channels: dict[int, int] = {}
 
-    def describe(self, stamp_ns: int, description: JsonObject) -> None:
-        self._note(self._descriptions, stamp_ns, description)
-
-    def event(self, stamp_ns: int, event: JsonObject) -> None:
-        """Write an event received at `stamp_ns`."""
-        self._note(self._events, stamp_ns, event)
+    def note(self, note: Note) -> None:
+        """Write a description or an event."""
+        channel = self._descriptions if isinstance(note, RecordedDescription) else self._events
+        self._mcap.message(channel, note.stamp_ns, file_format.pack_json(note[1]), self._notes)
+        self._notes += 1
 
     def frame(self, frame: DataMessage) -> None:
+        """Write a frame that was received."""
         channel = self._frame_channels.get(frame.sensor) or self._frame_channel(frame.sensor)
         self._mcap.message(channel, frame.stamp_ns, file_format.pack_frame(frame), frame.sequence & _U32)
         self.frames += 1
@@ -72,10 +72,6 @@ class RecordingWriter:
         self._mcap.finish()
         self._disk.sync()
         self._disk.close()
-
-    def _note(self, channel: int, stamp_ns: int, message: JsonObject) -> None:
-        self._mcap.message(channel, stamp_ns, file_format.pack_json(message), self._notes)
-        self._notes += 1
 
     def _frame_channel(self, sensor: int) -> int:
         if sensor not in self._frame_channels:

@@ -14,7 +14,7 @@ from typing import Any, Final, NoReturn
 from bota_clients.errors import RecordingError
 from bota_clients.program import Signals, say
 from bota_clients.progress import switch_off
-from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
+from bota_clients.recording.file_format import Note, RecordedEvent
 from bota_clients.recording.reader import Recording, open_recording
 from bota_clients.replay.pacing import Pacing
 from bota_clients.replay.sensors import ReplayedSensors, needs_sensor
@@ -118,7 +118,7 @@ class Player:
     def _has_subscriber(self) -> bool:
         return any(c.subscription is not None for c in self.hub.connections.values())
 
-    def _happen(self, note: RecordedDescription | RecordedEvent) -> None:
+    def _happen(self, note: Note) -> None:
         if isinstance(note, RecordedEvent) and note.by_recorder and note.name == "connected":
             self._pacing.reconnected()
         for message in self.sensors.follow(note):

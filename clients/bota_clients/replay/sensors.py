@@ -7,7 +7,7 @@ from collections import Counter
 from itertools import takewhile
 from typing import Any, Final, NoReturn
 
-from bota_clients.recording.file_format import RecordedDescription, RecordedEvent
+from bota_clients.recording.file_format import Note, RecordedDescription, RecordedEvent
 from bota_clients.recording.reader import Recording, follow
 from bota_ethercat.accounting import NOT_NEW
 from bota_ethercat.control import ErrorCode, Event, Request, event
@@ -113,9 +113,9 @@ class ReplayedSensors:
         self.sent = 0
         self._started = time.monotonic()
 
-    def follow(self, note: RecordedDescription | RecordedEvent) -> list[JsonObject]:
+    def follow(self, note: Note) -> list[JsonObject]:
         """Take the next description or event of the recording; the events to send."""
-        changed = [now for now in follow(self._timeline, note) if self._at(now.sensor)]
+        changed = follow(self._timeline, note)
         before = {now.sensor: self.sensors[now.sensor].in_force for now in changed}
         for now in changed:
             self.sensors[now.sensor].in_force = now
@@ -148,11 +148,7 @@ class ReplayedSensors:
             "duplicate_frames": 0,
             "wake_us": _NO_BUS,
             "exchange_us": _NO_BUS,
-            "last_10s": {
-                "wake_us": _NO_BUS,
-                "exchange_us": _NO_BUS,
-                "age_us": [_NO_BUS] * len(self.sensors),
-            },
+            "last_10s": {"wake_us": _NO_BUS, "exchange_us": _NO_BUS, "age_us": [_NO_BUS] * len(self.sensors)},
             "sensors": [sensor.status() for sensor in self.sensors],
             "uptime_s": round(time.monotonic() - self._started, 3),
         }
