@@ -64,13 +64,9 @@ def _view(examination: Examination) -> dict[str, Any]:
             if (value := subject.settings.get(setting)) is not None
         ],
         "meaning": "; ".join(meaning(subject.settings, rate_hz).lines()),
-        "groups": [(group, bool(series.saturated[:, 3 * at : 3 * at + 3].any()))
-                   for at, group in enumerate(groups)],
+        "groups": [(group, bool(series.saturated(group).any())) for group in groups],
         "noise_rows": _noise_rows(examination),
-        "deviations": ", ".join(
-            f"{figure(value * 1e6)} µs"
-            for value in series.deviations
-        ) if len(series.deviations) else "not known",
+        "deviations": ", ".join(f"{figure(value * 1e6)} µs" for value in series.deviations) or "not known",
     }  # fmt: skip
 
 
