@@ -16,9 +16,8 @@ import pytest
 
 from bota_clients.numbers import figure, seconds
 from bota_clients.recording.columns import Columns, Floats
-from bota_clients.report import page as page_module
 from bota_clients.report.checks import Examination
-from bota_clients.report.page import as_json, render
+from bota_clients.report.page import PAGE, as_json, render
 from bota_clients.report.plots import stretches
 from bota_clients.report.series import BINS, GROUPS, Bins
 from bota_ethercat.framing import DataFlag
@@ -135,7 +134,7 @@ def two() -> tuple[str, str]:
         Examination(replace(first, info=first.info._replace(sensor=1, serial=9), parts=[])),
     ]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(page_module, "GROUPS", GROUPS[:2])  # the others are drawn alike
+        patch.setitem(PAGE.globals, "GROUPS", GROUPS[:2])  # the others are drawn alike
         return render(examined, made=MADE, program="p", note=EVIL), as_json(examined)
 
 
@@ -170,7 +169,7 @@ HOSTILE: list[Callable[[Columns], dict[str, Any]]] = [
 def test_nonsense_is_examined_and_drawn_without_an_error(
     spoil: Callable[[Columns], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page_module, "GROUPS", GROUPS[:2])  # the others are drawn alike
+    monkeypatch.setitem(PAGE.globals, "GROUPS", GROUPS[:2])  # the others are drawn alike
     given = subject_of(simulate(3, sinc_length=128), sensor_row(sinc_length=128))
     examination = Examination(replace(given, parts=[replace(whole(given), **spoil(whole(given)))]))
     assert examination.headline != "Good"

@@ -204,10 +204,8 @@ class Examination:
         self.stream = judge(_observe(self.series))
         self.checks = [check for each in _CHECKS if (check := _made(each, self)) is not None]
         self.level, self.sentence = verdict(self.checks)
-
-    @property
-    def headline(self) -> str:
-        return "Not conclusive" if self.level is Level.NOT_POSSIBLE else self.level.words.capitalize()
+        is_open = self.level is Level.NOT_POSSIBLE
+        self.headline = "Not conclusive" if is_open else self.level.words.capitalize()
 
 
 def verdict(checks: Sequence[Check]) -> tuple[Level, str]:
@@ -217,17 +215,14 @@ def verdict(checks: Sequence[Check]) -> tuple[Level, str]:
         return [check.name.lower().replace("imu", "IMU") for check in checks if check.level in levels]
 
     wrong, unchecked = names(Level.LOOK, Level.TROUBLE), ", ".join(names(Level.NOT_POSSIBLE))
-    left_out = ", ".join(names(Level.NOT_APPLICABLE))
     not_checked = f" It could not be checked: {unchecked}." if unchecked else ""
     worst = max(check.level for check in checks)
     if wrong:
-        return (
-            worst,
-            f"{len(wrong)} of {len(checks)} checks found something: {', '.join(wrong)}.{not_checked}",
-        )
+        found = f"{len(wrong)} of {len(checks)} checks found something: {', '.join(wrong)}."
+        return worst, found + not_checked
     if unchecked:
         return worst, f"Nothing wrong was found, but not everything was checked.{not_checked}"
-    if left_out:
+    if left_out := ", ".join(names(Level.NOT_APPLICABLE)):
         return Level.GOOD, f"All applicable checks passed. Not applicable: {left_out}."
     return Level.GOOD, "All checks passed."
 
