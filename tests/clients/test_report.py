@@ -5,6 +5,7 @@ The samples are the virtual sensor's own, taken through the server's own stream 
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,11 +15,13 @@ import numpy as np
 import pytest
 
 from bota_clients.report.checks import Check, Examination
-from bota_clients.report.series import CHANNELS, Subject, channel_limit, limit_origin
+from bota_clients.report.page import render
+from bota_clients.report.series import CHANNELS, Histogram, Subject, limit_origin
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.health.limits import Level
 from bota_ethercat.pdo import STANDARD_GRAVITY
 from ethercat_server.virtual_sensor.signals import poses
+from tests.bridge.test_soak import size
 from tests.clients.simulated import sensor, simulate, subject_of, whole
 from tests.descriptions import sensor_row
 from tests.simulation import more_if_long
@@ -185,6 +188,33 @@ def test_a_sensor_that_never_gave_anything_new_is_no_healthy_one() -> None:
     assert check_of(examination, FORCE_TORQUE).level is NOT_POSSIBLE
 
 
+@pytest.mark.parametrize("cuts", [(1, 2, 600), (0, 100, 101, 1000, 1050, 1060, 2000, 2410)])
+def test_in_which_parts_the_frames_come_changes_nothing(cuts: Sequence[int]) -> None:
+    """A silence, losses, frames that are old, a channel that is stuck, and one that is saturated."""
+    script = ((2.0, "freeze force.x"), (2.5, "limit torque.z 0.05"), (4.0, "skip 3"), (5.5, "thaw force.x"))
+    sent = list(simulate(SECONDS, at=script, sinc_length=SINC, seed=3))
+    sent = flagged([*sent[:2400], *sent[2390:]], DataFlag.INVALID, range(1000, 1100))
+    once, found = subject_of(sent, ROW), list[tuple[Any, ...]]()
+    edges = [*cuts, len(sent)]
+    parts = [whole(once).where(slice(*ends)) for ends in itertools.pairwise([0, *edges])]
+    for each in once, replace(once, parts=[part for part in parts if len(part)]):
+        examined = Examination(each)
+        found.append(
+            (examined.checks, examined.runs, examined.sentence, render([examined], made="", program=""))
+        )
+    assert found[0] == found[1]
+    assert (examined.series.counts.old, examined.noise.windows) == (10, 13)
+
+
+def test_of_more_numbers_than_are_kept_quantiles_are_near() -> None:
+    numbers, found = np.random.default_rng(1).integers(0, 1 << 20, 1_000_000), Histogram()
+    for part in np.array_split(numbers, 50):
+        found.add(part)
+    shares = (0.5, 0.95, 1.0)
+    assert found.quantiles(*shares) == pytest.approx(np.quantile(numbers, shares), abs=16)
+    assert size(found) < 8 << 20
+
+
 # What the frames say, changed by hand.
 
 
@@ -215,6 +245,14 @@ def test_where_two_of_three_samples_are_lost_the_usual_interval_is_not_the_perio
 def test_invalid_frames_are_a_silence(frames: tuple[DataMessage, ...]) -> None:
     kept = flagged(frames, DataFlag.INVALID, range(2000, 2025))  # 62 ms, and 0.9 %
     assert expect(subject_of(kept, ROW), {SILENT: (TROUBLE, "25 frames were invalid")}).series.lost == 0
+
+
+@pytest.mark.parametrize("rows", [range(401), range(2400, 2801)])
+def test_before_the_first_sample_and_after_the_last_is_silence_too(
+    frames: tuple[DataMessage, ...], rows: range
+) -> None:
+    series = Examination(subject_of(flagged(frames, DataFlag.INVALID, rows), ROW)).series
+    assert series.longest_silence == pytest.approx(1.0, rel=0.01)
 
 
 def test_the_time_without_a_connection_is_not_in_the_sampling_rate(frames: tuple[DataMessage, ...]) -> None:
@@ -305,7 +343,7 @@ def test_values_that_are_no_numbers_are_found_and_spoil_nothing_else(healthy: Su
 
 @pytest.mark.parametrize("count", [0, 1, 2, 50, 400])
 def test_too_little_is_not_conclusive(healthy: Subject, count: int) -> None:
-    short = replace(healthy, parts=[whole(healthy).where(slice(count))])
+    short = replace(healthy, parts=[whole(healthy).where(slice(count))] * bool(count))
     examination = Examination(short)
     assert examination.headline == "Not conclusive"
     assert TROUBLE not in {check.level for check in examination.checks}
@@ -320,13 +358,11 @@ def test_a_rate_that_chop_divides_is_that_of_the_report() -> None:
 def test_limits_are_botas_at_the_published_lengths_and_between_them_in_between() -> None:
     table = {51: [0.6, 0.6, 0.6, 0.014, 0.014, 0.005], 1024: [0.1, 0.1, 0.08, 0.0015, 0.0015, 0.0007]}
     for length, limits in table.items():
-        assert [channel_limit(channel, length) for channel in CHANNELS] == pytest.approx(
-            [*limits, *[0.1] * 6]
-        )
+        assert [channel.limit(length) for channel in CHANNELS] == pytest.approx([*limits, *[0.1] * 6])
     for channel in CHANNELS[:6]:
-        limits = [channel_limit(channel, length) for length in (32, 51, 64, 128, 256, 341, 1024, 2048)]
+        limits = [channel.limit(length) for length in (32, 51, 64, 128, 256, 341, 1024, 2048)]
         assert limits == sorted(limits, reverse=True)
-    assert channel_limit(CHANNELS[0], 229) == pytest.approx(np.sqrt(0.6 * 0.1), rel=0.01), "half-way in a log"
+    assert CHANNELS[0].limit(229) == pytest.approx(np.sqrt(0.6 * 0.1), rel=0.01), "half-way in a log"
     assert "own test limits for SINC 51" in limit_origin(51)
     assert "interpolated between" in limit_origin(64)
     assert "extrapolated from" in limit_origin(32)

@@ -16,11 +16,10 @@ import pytest
 
 from bota_clients.numbers import figure, seconds
 from bota_clients.recording.columns import Columns, Floats
-from bota_clients.report import page as page_module
 from bota_clients.report.checks import Examination
-from bota_clients.report.page import as_json, render
+from bota_clients.report.page import PAGE, as_json, render
 from bota_clients.report.plots import stretches
-from bota_clients.report.series import GROUPS, Envelope
+from bota_clients.report.series import BINS, GROUPS, Bins
 from bota_ethercat.framing import DataFlag
 from tests.clients.simulated import sensor, simulate, subject_of, whole
 from tests.descriptions import sensor_row
@@ -135,7 +134,7 @@ def two() -> tuple[str, str]:
         Examination(replace(first, info=first.info._replace(sensor=1, serial=9), parts=[])),
     ]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(page_module, "GROUPS", GROUPS[:2])  # the others are drawn alike
+        patch.setitem(PAGE.globals, "GROUPS", GROUPS[:2])  # the others are drawn alike
         return render(examined, made=MADE, program="p", note=EVIL), as_json(examined)
 
 
@@ -170,7 +169,7 @@ HOSTILE: list[Callable[[Columns], dict[str, Any]]] = [
 def test_nonsense_is_examined_and_drawn_without_an_error(
     spoil: Callable[[Columns], dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page_module, "GROUPS", GROUPS[:2])  # the others are drawn alike
+    monkeypatch.setitem(PAGE.globals, "GROUPS", GROUPS[:2])  # the others are drawn alike
     given = subject_of(simulate(3, sinc_length=128), sensor_row(sinc_length=128))
     examination = Examination(replace(given, parts=[replace(whole(given), **spoil(whole(given)))]))
     assert examination.headline != "Good"
@@ -205,15 +204,17 @@ def test_many_samples_make_no_larger_a_page() -> None:
 
 def test_a_spike_is_never_averaged_away() -> None:
     time: Floats = np.linspace(0.0, 99.999, 100_000)
-    values = np.zeros(100_000)
+    values, flags = np.zeros(100_000), np.zeros((100_000, 1), np.int64)
     values[31_415], values[27_182] = 5.0, np.nan
-    found = Envelope(100.0, 1)
+    flags[[14_280, 14_290, 31_415, 31_417], 0] = 1, 2, 1, 4
+    found, bin_of_it = Bins(100.0, 1, 1), int(31.415 / 100 * BINS)
     for part in np.array_split(np.arange(100_000), 7):
-        found.add(time[part], values[part, np.newaxis])
+        found.add(time[part], values[part, np.newaxis], flags[part])
     assert np.nanmax(found.high) == 5.0
-    assert found.high[int(31.415 / 100 * len(found.middles))] == 5.0
+    assert found.high[0, bin_of_it] == 5.0
     assert np.nanmin(found.low) == 0.0
     assert 0 < np.nanmax(found.mean) < 0.1
+    assert (found.flags[0, bin_of_it], found.flags.sum()) == (5, 8), "bits of a bin that came in two parts"
 
 
 def test_stretches_join_neighbours() -> None:

@@ -23,8 +23,8 @@ from typing import Any, Final, NamedTuple, cast
 import numpy as np
 
 from bota_clients.numbers import count, figure, listing, seconds
-from bota_clients.recording.columns import Bools, Floats, Ints
-from bota_clients.report.series import CHANNELS, Samples, Series, Subject, channel_limit
+from bota_clients.recording.columns import Bools, Floats
+from bota_clients.report.series import CHANNELS, Samples, Series, Subject
 from bota_ethercat.health.judge import SATURATIONS, Observation, judge
 from bota_ethercat.health.limits import LIMITS, Level
 from bota_ethercat.pdo import STANDARD_GRAVITY
@@ -42,71 +42,50 @@ _LONGEST_WINDOW: Final = 1 << 18  # samples, of a clock that stands
 _FILLED: Final = 0.8  # share of its samples that a window must have
 
 
-class Noise(NamedTuple):
-    """Noise of the 12 channels, as standard deviations; NaN if unknown."""
+class Noise:
+    """Noise of the 12 channels, as standard deviations, in the windows of samples, which come in time.
 
-    deviation: Floats  # (12,)
-    limit: Floats  # (12,) of a healthy sensor
-    windows: int
-    calm: int  # how many of the windows were used
-    window_s: float
-    noisy: Ints  # (12,) windows that are clearly above the limit, of all
-    worst: Floats  # (12,) standard deviation in the worst of these
-
-    @property
-    def shaken(self) -> bool:
-        """Whether the sensor was shaken, even in the calm windows."""
-        return bool(_shaken(self.deviation, self.limit))
-
-
-class _Windows:
-    """Measures noise in the windows of samples, which come in time."""
+    Attributes:
+        deviation: (12,) in the calm windows; NaN if unknown.
+        limit: (12,) of a healthy sensor; NaN where there is none: raw counts, an unknown SINC length, an IMU
+            that is off.
+        windows: how many there are.
+        calm: how many of them are used.
+        window_s: how long one is.
+        noisy: (12,) windows that are clearly above the limit, of all.
+        worst: (12,) standard deviation in the worst of these.
+    """
 
     def __init__(self, series: Series) -> None:
-        self._series, self._limit = series, _limits(series)
-        self._length = max(_WINDOW_S, _FEWEST_SAMPLES * series.period)
-        self._fewest = max(_FEWEST_SAMPLES // 2, int(_FILLED * self._length / series.period))
+        length = series.subject.sinc_length if series.subject.settings.get("calibration_matrix") else None
+        has_none = [series.imu_off if channel.group.is_imu else length is None for channel in CHANNELS]
+        self.limit = np.where(has_none, np.nan, [channel.limit(length or 1) for channel in CHANNELS])
+        self.window_s = max(_WINDOW_S, _FEWEST_SAMPLES * series.period)
+        self.windows = self.calm = 0
+        self.deviation = np.full(len(CHANNELS), np.nan)
+        self.noisy, self.worst = np.zeros(len(CHANNELS), np.int64), np.zeros(len(CHANNELS))
+        self._period = series.period
+        self._fewest = max(_FEWEST_SAMPLES // 2, int(_FILLED * self.window_s / series.period))
         # Time, values and usable of the window that goes on.
         self._rest: Sequence[Any] = np.zeros(0), np.zeros((0, 12)), np.zeros((0, 12), bool)
-        self._count = 0
         self._every = 1  # one of so many windows is remembered
         self._kept = list[Floats]()  # (2, 12): deviation, range
-        self._noisy, self._worst = np.zeros(len(CHANNELS), np.int64), np.zeros(len(CHANNELS))
 
-    def add(self, samples: Samples | None) -> None:
-        """None: the end."""
-        rows = self._rest
-        if samples is not None:
-            rows = [np.concatenate(each) for each in zip(rows, samples[:3], strict=True)]
-        number = np.floor(rows[0] / self._length)
+    def add(self, samples: Samples) -> None:
+        """The next ones."""
+        self._rest = [np.concatenate(each) for each in zip(self._rest, samples[:3], strict=True)]
+        number = np.floor(self._rest[0] / self.window_s)
         # A clock that jumps back must not join samples that are far apart.
         edges = [0, *(np.flatnonzero(np.diff(number) != 0) + 1).tolist()]
-        if samples is None or len(number) - edges[-1] > _LONGEST_WINDOW:
+        if len(number) - edges[-1] > _LONGEST_WINDOW:
             edges.append(len(number))
-        for begin, end in itertools.pairwise(edges):
-            if end - begin >= self._fewest:
-                self._measure(*(each[begin:end] for each in rows))
-        self._rest = [each[edges[-1] :] for each in rows]
+        self._measure(edges)
 
-    def _measure(self, time: Floats, values: Floats, usable: Bools) -> None:
-        deviation, reach, rough = _window(time, values, usable)
-        if _shaken(deviation, self._limit):
-            rough = np.full(len(CHANNELS), np.nan)
-        touched = reach * (self._series.period / _CONTACT_S) ** 2
-        noisy = rough > self._limit * max(_NOISY, 1 + 5 / math.sqrt(len(time))) + touched
-        self._noisy += noisy
-        self._worst = np.fmax(self._worst, np.where(noisy, rough, 0.0))
-        if self._count % self._every == 0:
-            self._kept.append(np.array([deviation, reach]))
-            if len(self._kept) > _MOST_WINDOWS:
-                self._kept, self._every = self._kept[::2], 2 * self._every
-        self._count += 1
-
-    def noise(self) -> Noise:
-        unknown = np.full(len(CHANNELS), np.nan)
-        if self._count < _FEWEST_WINDOWS:
-            nothing = np.zeros(len(CHANNELS), np.int64)
-            return Noise(unknown, self._limit, self._count, 0, self._length, nothing, unknown)
+    def end(self) -> None:
+        """There are no more: choose the calm windows."""
+        self._measure([0, len(self._rest[0])])
+        if self.windows < _FEWEST_WINDOWS:
+            return
         deviations, ranges = np.array(self._kept).transpose(1, 0, 2)
         # A window in which a channel is unusable counts as the least calm.
         reaches = np.where(np.isfinite(ranges), ranges, np.inf)[:, :6]
@@ -115,10 +94,27 @@ class _Windows:
         unrest = (reaches[:, known] / usual[known]).max(axis=1, initial=0.0)
         calm = deviations[np.argsort(unrest, kind="stable")[: max(_FEWEST_WINDOWS, len(unrest) // 2)]]
         measured = np.sum(np.isfinite(calm), axis=0) >= _FEWEST_WINDOWS // 2
-        deviation = unknown
-        deviation[measured] = np.nanmedian(calm[:, measured], axis=0)
-        used = max(_FEWEST_WINDOWS, self._count // 2)
-        return Noise(deviation, self._limit, self._count, used, self._length, self._noisy, self._worst)
+        self.deviation[measured] = np.nanmedian(calm[:, measured], axis=0)
+        self.calm = max(_FEWEST_WINDOWS, self.windows // 2)
+
+    def _measure(self, edges: Sequence[int]) -> None:
+        """The windows between these samples."""
+        for begin, end in itertools.pairwise(edges):
+            if end - begin < self._fewest:
+                continue
+            deviation, reach, rough = _window(*(each[begin:end] for each in self._rest))
+            if _is_shaken(deviation, self.limit):
+                rough = np.full(len(CHANNELS), np.nan)
+            touched = reach * (self._period / _CONTACT_S) ** 2
+            noisy = rough > self.limit * max(_NOISY, 1 + 5 / math.sqrt(end - begin)) + touched
+            self.noisy += noisy
+            self.worst = np.fmax(self.worst, np.where(noisy, rough, 0.0))
+            if self.windows % self._every == 0:
+                self._kept.append(np.array([deviation, reach]))
+                if len(self._kept) > _MOST_WINDOWS:
+                    self._kept, self._every = self._kept[::2], 2 * self._every
+            self.windows += 1
+        self._rest = [each[edges[-1] :] for each in self._rest]
 
 
 class Run(NamedTuple):
@@ -139,53 +135,32 @@ class _Runs:
 
     def __init__(self) -> None:
         nothing = Run(math.nan, 0.0, -1.0, 0)
-        self.longest, self._last = [nothing] * len(CHANNELS), [nothing] * len(CHANNELS)
-        self._is_usable = np.zeros(len(CHANNELS), bool)
+        self.longest, self._latest = [nothing] * len(CHANNELS), [nothing] * len(CHANNELS)
+        self._is_usable = np.zeros((1, len(CHANNELS)), bool)
 
     def add(self, samples: Samples) -> None:
-        if not len(samples.time):
-            return
         usable, values, time = samples.usable, samples.values, samples.time
         # Values that are saturated or not finite belong to other checks: each is a run of its own.
-        apart = ~usable | ~np.concatenate([self._is_usable[np.newaxis], usable[:-1]])
-        before = np.concatenate([[[run.value for run in self._last]], values[:-1]])
+        apart = ~usable | ~np.concatenate([self._is_usable, usable])[:-1]
+        before = np.concatenate([[[run.value for run in self._latest]], values])[:-1]
         changed = (values != before) | apart | (samples.interval_ns <= 0)[:, np.newaxis]
-        for channel in range(len(CHANNELS)):
-            starts = np.append(np.flatnonzero(changed[:, channel]), len(time))
-            value = values[:, channel]
-            last = self._last[channel]
-            if starts[0]:  # it goes on
-                at = int(starts[0])
-                last = last._replace(end_s=float(time[at - 1]), samples=last.samples + at)
-            self._note(channel, last)
-            if len(starts) > 1:
-                spans = time[starts[1:] - 1] - time[starts[:-1]]
-                for run in (int(np.argmax(spans)), len(spans) - 1):
-                    begin, end = starts[run : run + 2].tolist()
-                    last = Run(float(value[begin]), float(time[begin]), float(time[end - 1]), end - begin)
-                    self._note(channel, last)
-            self._last[channel] = last
-        self._is_usable = usable[-1]
-
-    def _note(self, channel: int, run: Run) -> None:
-        if run.seconds > self.longest[channel].seconds:
-            self.longest[channel] = run
+        until_s = np.append(self._latest[0].end_s, time)  # of the sample before each, and of the last
+        for channel, latest in enumerate(self._latest):
+            starts = np.flatnonzero(changed[:, channel])
+            # Of the run that goes on and those that begin: the first sample, and the one behind the last.
+            begins, ends = np.append(-latest.samples, starts), np.append(starts, len(time))
+            begins_s, ends_s = np.append(latest.begin_s, time[starts]), until_s[ends]
+            for at in (int(np.argmax(ends_s - begins_s)), len(starts)):
+                value = float(values[begins[at], channel]) if at else latest.value
+                run = Run(value, float(begins_s[at]), float(ends_s[at]), int(ends[at] - begins[at]))
+                self.longest[channel] = max(self.longest[channel], run, key=lambda run: run.seconds)
+            self._latest[channel] = run
+        self._is_usable = np.concatenate([self._is_usable, usable])[-1:]
 
 
-def _shaken(deviation: Floats, limit: Floats) -> Bools:
+def _is_shaken(deviation: Floats, limit: Floats) -> bool:
     """Whether at least two axes of the accelerometer are above their limit: that is motion."""
-    shaken: Bools = np.sum(deviation[..., 6:9] > limit[6:9], axis=-1) >= 2
-    return shaken
-
-
-def _limits(series: Series) -> Floats:
-    """(12,) NaN where there is none: raw counts, an unknown SINC length, an IMU that is off."""
-    length = series.subject.sinc_length if series.subject.settings.get("calibration_matrix") else None
-    return np.array([
-        math.nan if (series.imu_off if channel.group.is_imu else length is None)
-        else channel_limit(channel, length or 1)
-        for channel in CHANNELS
-    ])  # fmt: skip
+    return int(np.sum(deviation[6:9] > limit[6:9])) >= 2
 
 
 def _window(time: Floats, values: Floats, usable: Bools) -> Floats:
@@ -219,20 +194,18 @@ class Examination:
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
         self.series = Series(subject)
-        windows, runs = _Windows(self.series), _Runs()
+        self.noise, runs = Noise(self.series), _Runs()
         for samples in self.series.read():
-            windows.add(samples)
+            self.noise.add(samples)
             runs.add(samples)
-        windows.add(None)
-        self.noise, self.runs = windows.noise(), runs.longest
+        self.noise.end()
+        self.runs = runs.longest
         # Of the judge of all programs; the checks beyond it are this report's own.
         self.stream = judge(_observe(self.series))
         self.checks = [check for each in _CHECKS if (check := _made(each, self)) is not None]
         self.level, self.sentence = verdict(self.checks)
-
-    @property
-    def headline(self) -> str:
-        return "Not conclusive" if self.level is Level.NOT_POSSIBLE else self.level.words.capitalize()
+        is_open = self.level is Level.NOT_POSSIBLE
+        self.headline = "Not conclusive" if is_open else self.level.words.capitalize()
 
 
 def verdict(checks: Sequence[Check]) -> tuple[Level, str]:
@@ -242,17 +215,14 @@ def verdict(checks: Sequence[Check]) -> tuple[Level, str]:
         return [check.name.lower().replace("imu", "IMU") for check in checks if check.level in levels]
 
     wrong, unchecked = names(Level.LOOK, Level.TROUBLE), ", ".join(names(Level.NOT_POSSIBLE))
-    left_out = ", ".join(names(Level.NOT_APPLICABLE))
     not_checked = f" It could not be checked: {unchecked}." if unchecked else ""
     worst = max(check.level for check in checks)
     if wrong:
-        return (
-            worst,
-            f"{len(wrong)} of {len(checks)} checks found something: {', '.join(wrong)}.{not_checked}",
-        )
+        found = f"{len(wrong)} of {len(checks)} checks found something: {', '.join(wrong)}."
+        return worst, found + not_checked
     if unchecked:
         return worst, f"Nothing wrong was found, but not everything was checked.{not_checked}"
-    if left_out:
+    if left_out := ", ".join(names(Level.NOT_APPLICABLE)):
         return Level.GOOD, f"All applicable checks passed. Not applicable: {left_out}."
     return Level.GOOD, "All checks passed."
 
@@ -360,7 +330,7 @@ def _noise(noise: Noise, indices: range) -> Check:
         return f"{figure(size[n])} {CHANNELS[n].group.unit}, {limit}"
 
     if above := [n for n in indices if ratio[n] > 1]:
-        if noise.shaken:
+        if _is_shaken(noise.deviation, noise.limit):  # even in the calm windows
             shaken = "The sensor was shaken all the time (the accelerometer shows it)"
             found = f"{shaken}, so noise cannot be told from vibration."
             return _not_possible(found, "Record again with the sensor stationary.")
@@ -485,7 +455,8 @@ def _observe(series: Series) -> Observation:
         not_finite=series.not_finite,
         **cast(Any, series.bits),
         temperature=coldest if coldest < LIMITS.coldest else hottest,
-        locked=False if judged and series.is_irregular else None,
+        # Whether the stamps are not those of a clock that is followed.
+        locked=False if judged and series.usual_deviation > LIMITS.irregular * series.period else None,
         lost_because=series.subject.lost_because,
         settings=series.subject.settings,
     )

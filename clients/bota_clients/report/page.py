@@ -25,7 +25,7 @@ def _plain(value: Any) -> Any:
     return value if value is None or hasattr(value, "__html__") else visible(str(value))
 
 
-_PAGE: Final = jinja2.Environment(
+PAGE: Final = jinja2.Environment(
     loader=jinja2.FileSystemLoader(Path(__file__).parent),
     autoescape=True,
     finalize=_plain,
@@ -33,15 +33,15 @@ _PAGE: Final = jinja2.Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_PAGE.filters |= {name: getattr(numbers, name) for name in ("count", "figure", "moment", "seconds", "share")}
-_PAGE.globals |= {"plots": plots, "DENSE": DENSE, "GROUPS": GROUPS, "limit_origin": limit_origin}
+PAGE.filters |= {name: getattr(numbers, name) for name in ("count", "figure", "moment", "seconds", "share")}
+PAGE.globals |= {"plots": plots, "DENSE": DENSE, "GROUPS": GROUPS, "limit_origin": limit_origin}
 
 
 def render(examinations: Sequence[Examination], *, made: str, program: str, note: str = "") -> str:
     """The whole page. `made` is the time, `program` what made it; `note` is a remark of the user's."""
     first = examinations[0].subject
     several = f"{len(examinations)} sensors" if len(examinations) > 1 else first.who
-    return _PAGE.get_template("report.html").render(
+    return PAGE.get_template("report.html").render(
         title=f"Sensor report: {several}",
         made=made,
         program=program,
@@ -54,9 +54,7 @@ def _view(examination: Examination) -> dict[str, Any]:
     """What the template shows of one sensor, beside the examination's own."""
     subject, series = examination.subject, examination.series
     rate_hz, chop = round(subject.info.rate_hz), subject.settings.get("chop")
-    groups = [group for group in GROUPS if not (group.is_imu and series.imu_off)]
     return {
-        "headline": examination.headline,
         "name": f"Sensor {subject.info.sensor}: {subject.who}",
         "settings": [
             (setting, str(value).lower(), value_meaning(setting, value, rate_hz, chop))
@@ -64,13 +62,8 @@ def _view(examination: Examination) -> dict[str, Any]:
             if (value := subject.settings.get(setting)) is not None
         ],
         "meaning": "; ".join(meaning(subject.settings, rate_hz).lines()),
-        "groups": [(group, bool(series.saturated[:, 3 * at : 3 * at + 3].any()))
-                   for at, group in enumerate(groups)],
         "noise_rows": _noise_rows(examination),
-        "deviations": ", ".join(
-            f"{figure(value * 1e6)} µs"
-            for value in series.deviations
-        ) if len(series.deviations) else "not known",
+        "deviations": ", ".join(f"{figure(value * 1e6)} µs" for value in series.deviations) or "not known",
     }  # fmt: skip
 
 

@@ -66,9 +66,9 @@ class _Plot:
             self._text(0.5 * (_LEFT + _RIGHT), middle, "no data", more=f' fill="{MUTED}"')
         return known
 
-    def line(self, times: Floats, values: Floats, color: str, width: float = 1.3) -> None:
+    def line(self, times: Floats, values: Floats, color: str) -> None:
         """Interrupted where a value is not finite."""
-        self._path(times, self._share(np.where(np.isfinite(values), values, np.nan)), color, width)
+        self._path(times, self._share(values), color, 1.3)
 
     def bars(self, times: Floats, low: Floats, high: Floats, color: str) -> None:
         heights = self._share(np.column_stack([low, high]))
@@ -117,20 +117,20 @@ def stretches(bins: Bools, width: float) -> Floats:
 def over_time(plot: _Plot, series: Series, group: Group) -> str:
     """Three panels, x, y and z: mean and range of each bin; marks where it was saturated or lost samples."""
     texts = []
-    envelope, few = series.envelope, series.few
-    lost = stretches(series.lossy, series.width).mean(axis=1, keepdims=True)
+    bins, saturated = series.bins, series.saturated(group)
+    lost = stretches(bins.flags[-1] > 0, series.width).mean(axis=1, keepdims=True)
     for axis, color in enumerate(AXES):
         index = 3 * GROUPS.index(group) + axis
-        low, high = envelope.low[:, index], envelope.high[:, index]
+        low, high = bins.low[index], bins.high[index]
         known = plot.begin(f"{'xyz'[axis]}, {group.unit}", low, high, series.width)
-        if known and few:
-            times, rows, apart = zip(*few, strict=True)
-            at = np.flatnonzero(apart)  # where the line is interrupted
-            plot.line(np.insert(times, at, 0.0), np.insert(np.array(rows)[:, index], at, np.nan), color)
+        if known and series.few:
+            times, rows, _, _, is_apart = map(np.concatenate, zip(*series.few, strict=True))
+            at = np.flatnonzero(is_apart)  # where the line is interrupted
+            plot.line(np.insert(times, at, 0.0), np.insert(rows[:, index], at, np.nan), color)
         elif known:
-            plot.bars(envelope.middles, low, high, color)
-            plot.line(envelope.middles, envelope.mean[:, index], color)
-        plot.segments(stretches(series.saturated[:, index], series.width), (0.985, 0.985), BAD, 4)
+            plot.bars(bins.middles, low, high, color)
+            plot.line(bins.middles, bins.mean[index], color)
+        plot.segments(stretches(saturated[axis], series.width), (0.985, 0.985), BAD, 4)
         plot.segments(np.tile(lost, 2), (0.0, 0.07), INK, 1)
         if known:
             least, most = number(np.nanmin(low)), number(np.nanmax(high))
@@ -140,10 +140,10 @@ def over_time(plot: _Plot, series: Series, group: Group) -> str:
 
 def temperature(plot: _Plot, series: Series) -> str:
     """The mean of each bin."""
-    mean = series.envelope.mean[:, -1]
+    mean = series.bins.mean[-1]
     if series.temperatures is None:
         return ""
     known = np.isfinite(mean)
     plot.begin("°C", mean, mean, series.width)
-    plot.line(series.envelope.middles[known], mean[known], PLAIN)
+    plot.line(series.bins.middles[known], mean[known], PLAIN)
     return f"Temperature from {number(series.temperatures[0])} to {number(series.temperatures[1])} °C."
