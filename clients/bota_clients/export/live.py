@@ -14,13 +14,14 @@ to the sensor's own offset marks the same samples if the server says so beforeha
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from bota_clients.export.windows import Arrays, Rows, Windows, read_tool
-from bota_clients.recording.columns import columns
+from bota_clients.recording.columns import Columns, columns
 from bota_ethercat.client import Client
 from bota_ethercat.client.session import Item
 from bota_ethercat.framing import DataMessage
@@ -116,7 +117,8 @@ class LiveWindows:
         (stamp, instant), (later, then) = near[0], near[-1]
         return instant + round((stamp_ns - stamp) * ((then - instant) / (later - stamp) if behind else 1.0))
 
-    def _take(self, items: list[Item]) -> None:
+    def _arrived(self, items: list[Item]) -> Iterator[tuple[InForce, Columns]]:
+        """The frames of the sensor, with what was in force."""
         frames = list[DataMessage]()
         for item in [*items, None]:
             if isinstance(item, DataMessage):
@@ -124,14 +126,14 @@ class LiveWindows:
                     frames.append(item)
                 continue
             if frames:
-                self._add(frames)
+                in_force = self._in_force or self._client.session.timeline[self._sensor]
+                yield in_force, columns(frames, self._units)
                 frames = []
             if isinstance(item, InForce) and item.sensor == self._sensor:
                 self._in_force = item
 
-    def _add(self, frames: list[DataMessage]) -> None:
-        arrived = self._in_force or self._client.session.timeline[self._sensor], columns(frames, self._units)
-        for new in self._windows.follow([arrived]):
+    def _take(self, items: list[Item]) -> None:
+        for new in self._windows.follow(self._arrived(items)):
             rows = np.empty(len(new), _STAMPS)
             rows["stamp_ns"], rows["monotonic_ns"] = new.stamp_ns, new.monotonic_ns
             self._clocks.add(rows)
