@@ -238,7 +238,7 @@ def test_memory_does_not_grow_with_the_length(
     tmp_path: Path, program: Callable[[Path], object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     peaks, path = [], tmp_path / "run.mcap"
-    monkeypatch.setattr(dataset, "_GROUP", 4096)
+    monkeypatch.setattr(dataset, "GROUP", 4096)
     for seconds in (200, 800):
         row = describe(0, **SETTINGS)
         row["sensors"][0]["rate_hz"] = RATE_HZ

@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple
 
 from bota_clients.errors import NothingAskedForError, RecordingError
 from bota_clients.export.cli import PROGRAM
-from bota_clients.export.dataset import about, arrow_of, in_chunks, windows_for, write_parquet
+from bota_clients.export.dataset import GROUP, about, arrow_of, in_chunks, windows_for, write_parquet
 from bota_clients.export.samples import MOST_LOST, in_part, samples_of
 from bota_clients.export.windows import read_tool
 from bota_clients.identify.program import choose
@@ -36,7 +36,6 @@ from bota_ethercat.errors import FileError, ProtocolError
 from bota_ethercat.program.version import VERSION
 from bota_ethercat.text.untrusted import visible
 
-_GROUP: Final = 131_072  # rows
 _BEGINNING: Final = 1024  # bytes that tell recordings apart
 _SOURCE: Final = "bota_ethercat_source"
 
@@ -57,7 +56,7 @@ def tables_of(options: argparse.Namespace, recording: Recording, sensor: int | N
     windows = windows_for(options, recording, chosen, MOST_LOST)
     said = about(options, recording, chosen, windows.tool)
     blocks = in_part(recording, windows, samples_of(recording, windows, chosen.sensor))
-    for block in in_chunks(blocks, _GROUP):
+    for block in in_chunks(blocks, GROUP):
         rows = arrow_of(block, said)
         numbers, name = pa.repeat(pa.scalar(0, pa.int32()), len(rows)), visible(recording.path.name)
         yield rows.append_column("recording", pa.DictionaryArray.from_arrays(numbers, [name]))

@@ -39,7 +39,7 @@ from bota_clients.numbers import count
 from bota_clients.recording.columns import REGISTERS, Ints
 from bota_clients.recording.mcap_writer import moved_to
 from bota_clients.recording.order import TimeAxis, in_order, longest_order
-from bota_clients.recording.reader import RecordedSensor, Recording, Since
+from bota_clients.recording.reader import RecordedSensor, Recording
 from bota_ethercat.errors import BadMessageError, FileError
 from bota_ethercat.program.command import command
 from bota_ethercat.program.new_file import EXISTS
@@ -53,7 +53,7 @@ from bota_ft_compensation.stream import obstacle
 _ALIGN: Final = command("ethercat-export align")
 ATTRIBUTES: Final = "bota_ethercat"  # their key in a file, as JSON
 _CHUNK: Final = 1024  # frames, in a file
-_GROUP: Final = 131_072  # samples, in a file
+GROUP: Final = 131_072  # samples, in a file
 _UNITS: Final = {"force": "N", "torque": "Nm", "acceleration": "m/s^2", "angular_rate": "rad/s", "age": "s"}
 _SECOND: Final = 1_000_000_000
 _PER_SECOND: Final = {"s": _SECOND, "ms": 1_000_000, "us": 1000, "ns": 1}
@@ -444,8 +444,17 @@ def windows_for(
 ) -> Windows:
     """With the tool that is asked for; RecordingError if it cannot compensate anything in the recording."""
     tool = options.tool and read_tool(options.tool)
-    if tool and any(tool.get("bias", ())):
-        _check_offsets(options.tool, tool, recording, sensor.offsets)
+    if tool and any(tool.get("bias", ())):  # is it known what it is with the sensor's own offset?
+        if offset_of(tool) is None:
+            raise RecordingError(
+                f"{options.tool} does not say with which offset of the sensor its bias was measured: "
+                "identify the tool again, add sensor_offset if you know it, or leave the bias out"
+            )
+        if all(row.info.offset is None for row in sensor.offsets):
+            raise RecordingError(
+                f"{recording.path} does not have the sensor's own offset, so the bias of {options.tool} is "
+                "not known: record with a newer server, or leave the bias out"
+            )
     windows = Windows(length, tool=tool, imu_units=options.imu_units)
     if (stream := windows.stream) is not None:  # else what is compensated is marked, stretch by stretch
         has_tool = stream.plan.has_tool
@@ -474,7 +483,7 @@ def write(options: argparse.Namespace, recording: Recording) -> str:
         else:
             blocks = in_part(recording, windows, samples_of(recording, windows, sensor.sensor))
             blocks = _tallied(blocks, tally)
-        blocks = in_chunks(blocks, _CHUNK if frames else _GROUP)
+        blocks = in_chunks(blocks, _CHUNK if frames else GROUP)
         _WRITERS[options.suffix](made, said, blocks)
         if path.is_dir():
             shutil.rmtree(path)
@@ -519,22 +528,6 @@ def _tallied(blocks: Iterable[Arrays], tally: Counter[bool]) -> Iterator[Arrays]
         valid = int(block["valid"].sum())
         tally.update({True: valid, False: len(block["valid"]) - valid})
         yield block
-
-
-def _check_offsets(
-    path: Path, tool: Mapping[str, Any], recording: Recording, offsets: Sequence[Since]
-) -> None:
-    """RecordingError unless it is known what the bias is with the sensor's own offset in the recording."""
-    if offset_of(tool) is None:
-        raise RecordingError(
-            f"{path} does not say with which offset of the sensor its bias was measured: identify the tool "
-            "again, add sensor_offset if you know it, or leave the bias out"
-        )
-    if all(row.info.offset is None for row in offsets):
-        raise RecordingError(
-            f"{recording.path} does not have the sensor's own offset, so the bias of {path} is not known: "
-            "record with a newer server, or leave the bias out"
-        )
 
 
 def in_chunks(blocks: Iterable[Arrays], size: int) -> Iterator[Arrays]:

@@ -109,7 +109,7 @@ class Windows:
         until_ns: last instant of which nothing that comes later can be a part; -1 before the first sample.
         tool: parameters of the node; None: there is no compensated wrench.
         stream: what compensates; None without a tool.
-        axis: on which `follow` puts them.
+        axis: of time, on which `follow` puts the samples.
         doubt_ns: how long before an offset was reported samples may have part of it; 0 without a tool.
     """
 
@@ -125,6 +125,7 @@ class Windows:
         self._taken = self._epoch = 0  # samples; of what is in force
         self._begins = False  # another stream, which the first sample after a pause need not say
         self._settings, self._rate_hz = dict[str, SettingValue](), -1.0
+        self._delay_ns: Array = np.zeros(3)  # by channel
         self.doubt_ns = 0
         self.stream: CompensatedStream | None = None if tool is None else stream_of(tool)
 
@@ -142,8 +143,13 @@ class Windows:
         """
         settings, rate_hz = in_force.info.settings, in_force.info.rate_hz
         self._begins, self._epoch = self._begins or in_force.epoch != self._epoch, in_force.epoch
-        if self.stream is not None:
-            self._follow(in_force, self.stream)
+        if (stream := self.stream) is not None:
+            was_announced = stream.offset is None  # of what came since then nothing is compensated
+            stream.configure(in_force)
+            self.doubt_ns = in_force.doubt_ns
+            if stream.follow_offset() is not None and self.begin_ns >= 0 and not was_announced:
+                since_ns, slots = self._newest[0] - self.doubt_ns - self._delay_ns[0], self._slots.array
+                slots["compensated"][slots["measured_ns"][:, 0] >= since_ns] = math.nan
         if (settings, rate_hz) == (self._settings, self._rate_hz):
             return
         if not rate_hz:
@@ -151,18 +157,6 @@ class Windows:
         self._settings, self._rate_hz = dict(settings), rate_hz
         # Where a delay is unknown, a sample counts as measured only when it was stamped: never too early.
         self._delay_ns = np.array([delay or 0 for delay in Delays.parse(delays_ms(settings, rate_hz))])
-
-    def _follow(self, in_force: InForce, stream: CompensatedStream) -> None:
-        """What is in force for what follows, the sensor's own offset too."""
-        was_announced = stream.offset is None  # of what came since then nothing is compensated
-        stream.configure(in_force)
-        self.doubt_ns = in_force.doubt_ns
-        if stream.follow_offset() is None:
-            return
-        if self.begin_ns >= 0 and not was_announced:
-            since_ns = self._newest[0] - self.doubt_ns - self._delay_ns[0]
-            slots = self._slots.array
-            slots["compensated"][slots["measured_ns"][:, 0] >= since_ns] = math.nan
 
     def add(self, frames: Columns) -> Columns:
         """Take the next frames of the sensor, also REPEATED and INVALID ones; the samples. RecordingError.

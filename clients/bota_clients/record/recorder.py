@@ -199,7 +199,9 @@ class Recorder:
     def _run(self) -> None:
         try:
             self._record()
-            self._finish()
+            counts = {at: {"frames": each.frames, **asdict(each)} for at, each in self._counts().items()}
+            last = {"reason": self._reason, "dropped": str(self.dropped), "sensors": json.dumps(counts)}
+            self._writer.finish(last)
         except RecordingError as error:
             self._fail(error)
         except BaseException as error:
@@ -265,11 +267,6 @@ class Recorder:
             if (info := SensorInfo.parse(row)) is not None:
                 stream = self._streams[info.sensor]
                 stream.rate_hz = info.rate_hz or stream.rate_hz
-
-    def _finish(self) -> None:
-        counts = {at: {"frames": each.frames, **asdict(each)} for at, each in self._counts().items()}
-        dropped = str(self.dropped)
-        self._writer.finish({"reason": self._reason, "dropped": dropped, "sensors": json.dumps(counts)})
 
 
 def record(source: RecordingClient, recorder: Recorder, until: Callable[[Batch], str | None]) -> None:

@@ -47,12 +47,11 @@ def _fields(size: int) -> list[tuple[str, str, tuple[int, ...]]]:
     ]
 
 
-def _record(size: int) -> np.dtype[np.void]:
-    """A frame with this much process data as a message in a chunk: heads, frame and fields."""
-    return np.dtype([*HEADS, ("cdr", "<u4"), *_FRAME, ("size", "<u4"), *_fields(size)])
-
-
-RECORDS: Final = {size: _record(size) for size in sorted(LAYOUTS)}
+# By size of the process data, a frame as a message in a chunk: heads, frame and fields.
+RECORDS: Final = {
+    size: np.dtype([*HEADS, ("cdr", "<u4"), *_FRAME, ("size", "<u4"), *_fields(size)])
+    for size in sorted(LAYOUTS)
+}
 _SIZES: Final = np.vstack([*LAYOUTS]).astype("<u4")
 RECORD: Final = RECORDS[max(LAYOUTS)]  # the smaller begins alike
 _ARRIVED: Final = np.dtype([*_FRAME, ("process_data", f"V{max(LAYOUTS)}")])  # fields of a `DataMessage`
