@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from bota_clients.identify.cli import main
-from bota_clients.identify.stationary_periods import StationaryPeriod, find_stationary_periods
+from bota_clients.identify.stationary_periods import StationaryPeriod, StationaryPeriods, tables_of
 from bota_clients.recording.reader import open_recording
 from bota_ethercat.framing import DataFlag, DataMessage
 from bota_ethercat.pdo import STANDARD_GRAVITY, encode
@@ -76,6 +76,14 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def spoiled(frame: DataMessage) -> DataMessage:
+    """Force and torque are saturated, and the force is not finite."""
+    broken = bytearray(frame.process_data)
+    broken[29] = 0xFF
+    struct.pack_into("<f", broken, 5, math.inf)
+    return frame._replace(process_data=bytes(broken))
+
+
 def asked(*arguments: object) -> tuple[int, Any, str]:
     """Exit code, JSON and what was said, of a run with --json."""
     ended = run_here(main, *arguments, "--json")
@@ -92,10 +100,13 @@ def refused(*arguments: object) -> str:
 
 
 def periods(path: Path, least_seconds: float = 1.0) -> list[StationaryPeriod]:
+    stationary = StationaryPeriods(least_seconds)
     with open_recording(path) as opened:
-        found, rejected = find_stationary_periods([opened.columns(0)], least_seconds)
-    assert rejected == []
-    return found
+        for table in tables_of([opened.columns(0)]):
+            stationary.add(table)
+    stationary.end_stretch()
+    assert stationary.rejected == []
+    return stationary.found
 
 
 def test_it_finds_the_tool_and_the_bias(recording: Path) -> None:
@@ -174,9 +185,7 @@ def test_other_frames_and_bad_samples_do_not_matter(tmp_path: Path) -> None:
         if noise.random() < 0.1:
             mixed.append(frame._replace(flags=int(DataFlag.REPEATED)))
         if number == 150:
-            broken = bytearray(frame.process_data)
-            broken[29] = 0xFF  # force_torque_saturated
-            mixed[-1] = frame._replace(process_data=bytes(broken))
+            mixed[-1] = spoiled(frame)
         mixed.append(frame._replace(sensor=1))
     path = tmp_path / "mixed.mcap"
     record(path, mixed, sensors=(0, 1))
@@ -314,6 +323,10 @@ def test_the_inertia_is_found_if_the_tool_turned_between_the_poses_and_likely_if
     if turns:
         assert errors.max() < 0.0006
         assert max(found["tool_inertia_interval"]) < 0.001
+        of_two = [frame for frame in felt_frames(felt) if frame.monotonic_ns > 15.0e9]
+        record(tmp_path / "two.mcap", of_two, **settings)
+        code, by_motion, _ = asked(tmp_path / "two.mcap")
+        assert (code, by_motion["poses"]) == (0, []), "poses that do not suffice are not shown with a result"
     else:
         assert (errors < found["tool_inertia_interval"]).all()
         assert "hardly turned about" in " ".join(found["notes"])
@@ -323,7 +336,8 @@ def test_without_a_rest_all_is_found_by_motion_and_a_wrong_unit_is_refused(tmp_p
     tool = Payload(1.5, (0.05, -0.03, 0.07), (0.009, 0.011, 0.006, 0.001, -0.002, 0.001))
     settings: dict[str, Any] = start_up_defaults()
     felt = motion.filtered(motion.turned(3), tool, 10.0, settings)
-    record_felt(tmp_path / "a.mcap", felt, settings)
+    some_spoiled = (spoiled(each) if n % 100 == 50 else each for n, each in enumerate(felt_frames(felt)))
+    record(tmp_path / "a.mcap", some_spoiled, **settings)
     code, found, _ = asked(tmp_path / "a.mcap", "--yaml", tmp_path / "tool.yaml")
     assert (code, bool(problems("identify", found)), found["poses"]) == (0, False, [])
     truths: dict[str, Any] = {"mass": tool.mass, "center_of_gravity": tool.center, "inertia": tool.inertia}

@@ -6,32 +6,33 @@ import argparse
 import heapq
 import json
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from bota_clients.errors import RecordingError
 from bota_clients.identify.last_offset import AtLastOffset
 from bota_clients.identify.stationary_periods import (
     LEAST_S,
     StationaryPeriod,
-    find_stationary_periods,
-    usable_rows,
+    StationaryPeriods,
+    tables_of,
+    usable,
 )
 from bota_clients.identify.tool_file import write_bota
 from bota_clients.program import say
 from bota_clients.recording.asked import Asked
-from bota_clients.recording.columns import Columns, Floats
+from bota_clients.recording.columns import Floats
 from bota_clients.recording.reader import RecordedSensor, Recording, open_recording
-from bota_ethercat.pdo import STANDARD_GRAVITY, Vector3
+from bota_ethercat.pdo import STANDARD_GRAVITY
 from bota_ethercat.program.new_file import refuse_existing
 from bota_ft_compensation.alignment import align
 from bota_ft_compensation.identification.free_motion import identify_in_motion
-from bota_ft_compensation.identification.inertia import Turned, turn
+from bota_ft_compensation.identification.inertia import turn
 from bota_ft_compensation.identification.parameter_file import write_yaml
 from bota_ft_compensation.identification.payload import Fit, Identified, TooVagueError, identify, summary
 from bota_ft_compensation.identification.poses import MOST_POSES, Pose, pose_of
@@ -59,47 +60,41 @@ class Motion:
     """The usable samples of a recording, of a long one those parts in which the sensor turned the most."""
 
     def __init__(self) -> None:
-        self._begin_ns, self._seconds, self._number = -1, 0.0, 0
-        self._part, self._kept = list[Floats](), list[tuple[float, int, float, Floats]]()
+        self._part, self._seconds = np.zeros((0, 13)), 0.0
+        # Those parts, the one that turned least first: how much, from when on and for how long, s; samples.
+        self._kept = list[tuple[float, float, float, Floats]]()
 
-    def passing(self, parts: Iterable[Columns]) -> Iterator[Columns]:
-        """The same, which are taken from."""
-        for part in parts:
-            self._add(part.where(part.fresh))
-            yield part
-        self._end_part()
-
-    def rows(self) -> tuple[Floats, Floats]:
-        """Times (n,), s since the first sample, and what `usable_rows` gives (n, 12)."""
-        parts = [rows for _, _, _, rows in sorted(self._kept, key=lambda each: each[1])]
-        found = np.concatenate([np.zeros((0, 13)), *parts])
-        return found[:, 0], np.ascontiguousarray(found[:, 1:])
-
-    def _add(self, fresh: Columns) -> None:
-        if not len(fresh):
-            return
-        self._begin_ns = int(fresh.monotonic_ns[0]) if self._begin_ns < 0 else self._begin_ns
-        rows, good = usable_rows(fresh)
-        times = (fresh.monotonic_ns - self._begin_ns) * 1e-9
-        self._part.append(np.column_stack([times, rows])[good])
-        if len(self._part[-1]) and times[-1] - next(each for each in self._part if len(each))[0, 0] > _PART_S:
+    def add(self, table: Floats) -> None:
+        """The next of `tables_of`."""
+        found = usable(table)
+        self._part = np.concatenate([self._part, found])
+        if len(found) and table[-1, 0] - self._part[0, 0] > _PART_S:
             self._end_part()
 
+    def rows(self) -> tuple[Floats, Floats]:
+        """Times (n,), s since the first sample, and force, torque, acceleration, angular rate (n, 12)."""
+        self._end_part()
+        parts = (rows for _, _, _, rows in sorted(self._kept, key=lambda each: each[1]))
+        found = np.concatenate([self._part, *parts])
+        return found[:, 0], np.ascontiguousarray(found[:, 1:])
+
     def _end_part(self) -> None:
-        rows, self._part = np.concatenate([np.zeros((0, 13)), *self._part]), []
+        rows, self._part = self._part, self._part[:0]
         if not len(rows):
             return
-        seconds, turned = float(np.ptp(rows[:, 0])), float(rows[:, 10:].var(axis=0).sum())
-        self._number, self._seconds = self._number + 1, self._seconds + seconds
-        heapq.heappush(self._kept, (turned, self._number, seconds, rows))
+        turned, seconds = float(rows[:, 10:].var(axis=0).sum()), float(np.ptp(rows[:, 0]))
+        heapq.heappush(self._kept, (turned, float(rows[0, 0]), seconds, rows))
+        self._seconds += seconds
         while self._seconds - self._kept[0][2] > _MOST_MOTION_S:
             self._seconds -= heapq.heappop(self._kept)[2]
 
 
+_right: Final = partial(Column, justify="right")
+
+
 def show_poses(console: Console, poses: Poses, result: Identified | None) -> None:
-    table = Table(title="poses", title_justify="left")
-    for head in ("", "at s", "for s", "samples", "up x", "up y", "up z", "residual N", "residual Nm"):
-        table.add_column(head, justify="right")
+    heads = "", "at s", "for s", "samples", "up x", "up y", "up z", "residual N", "residual Nm"
+    table = Table(*map(_right, heads), title="poses", title_justify="left")
     for number, (period, pose) in enumerate(poses):
         left = ["", ""]
         if result is not None:
@@ -114,11 +109,8 @@ def show_poses(console: Console, poses: Poses, result: Identified | None) -> Non
 
 def show_result(console: Console, result: Identified) -> None:
     """The parameters with their intervals, and notes."""
-    table = Table(title="payload and bias", title_justify="left")
-    table.add_column("")
-    table.add_column("value", justify="right")
-    table.add_column(f"± ({100 * CONFIDENCE:g} %)", justify="right")
-    table.add_column("unit")
+    heads = "", _right("value"), _right(f"± ({100 * CONFIDENCE:g} %)"), "unit"
+    table = Table(*heads, title="payload and bias", title_justify="left")
     table.add_row("mass", f"{result.payload.mass:.4f}", f"{result.mass_interval:.4f}", "kg")
     center, inertia, interval, about = ([1000 * x for x in each] for each in result.payload[1:])
     bias, half = result.bias, result.bias_interval
@@ -150,9 +142,7 @@ def _fit(fit: Fit, unit: str) -> str:
     return f"{fit.rms:.3g} {unit} ({fit.verdict}{times})"
 
 
-def as_json(
-    poses: Poses, rejected: Sequence[str], result: Identified | None, error: str | None
-) -> dict[str, Any]:
+def as_json(poses: Poses, rejected: Sequence[str], result: Identified | None, error: str) -> dict[str, Any]:
     """Everything, in SI units; `ok` is whether there is a result."""
     rows: list[dict[str, Any]] = [
         {
@@ -204,26 +194,30 @@ def run(options: argparse.Namespace) -> int:
             if why := obstacle(row.info.settings, has_tool=True, by_imu=True):
                 raise RecordingError(f"{options.path} does not show a tool: {why}; and record again")
         read = AtLastOffset(recording, sensor, options.imu_units)
-        motion, offset = Motion(), read.offset
-        periods, rejected = find_stationary_periods(motion.passing(read))
+        motion, stationary = Motion(), StationaryPeriods()
+        for table in tables_of(read):
+            motion.add(table)
+            stationary.add(table)
+    stationary.end_stretch()
+    periods, rejected = stationary.found, stationary.rejected
     for remark in read.said:
         _say(f"{options.path}: {remark}")
     if len(periods) > MOST_POSES:
         periods = sorted(sorted(periods, key=lambda period: -period.seconds)[:MOST_POSES])
         _say(f"there are more than {MOST_POSES} poses: the longest are used")
-    poses, still, error = _solve(periods, options)
+    poses, still, error = _solve(periods, options.gravity or STANDARD_GRAVITY)
     try:
         result: Identified | None = _in_motion(motion, sensor, still)
         poses = poses if still else ()
     except CompensationError as refusal:
         result = None
-        if error is not None:
+        if error:
             error = f"{error}; or, {'with motion' if still else 'by motion alone'}: {refusal}"
         elif still is not None:
             note = f"the tool's inertia is not identified: {refusal}"
             result = still._replace(notes=(note, *still.notes))
     if result is not None:
-        _write_files(options, result, sensor, offset)
+        _write_files(options, result, sensor, read.offset)
     if options.json:
         sys.stdout.write(json.dumps(as_json(poses, rejected, result, error), indent=1) + "\n")
     else:
@@ -236,7 +230,7 @@ def run(options: argparse.Namespace) -> int:
     for sentence in rejected if result is None or not options.json else ():
         _say(f"rejected: {sentence}")
     if result is None:
-        _say(error or "no result")
+        _say(error)
         return 1
     return 0
 
@@ -250,14 +244,8 @@ def _write_files(
     if options.yaml is not None:
         who = f"{sensor.info.name}, serial number {sensor.info.serial}, from {options.path.name}"
         gravity = None if options.gravity is None else (0.0, 0.0, -options.gravity)
-        write_yaml(
-            options.yaml,
-            result,
-            f"{who}\n{summary(result)}",
-            gravity,
-            None if offset is None else Wrench.of(offset),
-            sensor.info.settings,
-        )
+        comment, own = f"{who}\n{summary(result)}", None if offset is None else Wrench.of(offset)
+        write_yaml(options.yaml, result, comment, gravity, own, sensor.info.settings)
         _say(f"written to {options.yaml}")
         if offset is None:
             _say(
@@ -268,21 +256,15 @@ def _write_files(
 
 def _in_motion(motion: Motion, sensor: RecordedSensor, poses: Identified | None) -> Identified:
     """By what the recording has of motion, beside poses or alone; CompensationError."""
-    return identify_in_motion(_turned(motion, sensor), _imu(sensor), poses)
-
-
-def _imu(sensor: RecordedSensor) -> Vector3:
-    return imu_position(sensor.info.name)
-
-
-def _turned(motion: Motion, sensor: RecordedSensor) -> Turned:
     if any(row.info.settings != sensor.info.settings for row in sensor.history):
         raise CompensationError("settings were changed during the recording")
-    times, rows = motion.rows()
-    if not len(times):
+    samples = motion.rows()
+    if not len(samples[0]):
         raise CompensationError("no sample can be used")
-    alignment = align(sensor.info.settings, sensor.info.rate_hz)
-    return turn(times, rows, alignment, EXACT, _imu(sensor))
+    alignment, imu = align(sensor.info.settings, sensor.info.rate_hz), imu_position(sensor.info.name)
+    turned = turn(*samples, alignment, EXACT, imu)
+    del samples  # there may be many
+    return identify_in_motion(turned, imu, poses)
 
 
 def choose(recording: Recording, position: int | None) -> RecordedSensor:
@@ -305,22 +287,18 @@ def choose(recording: Recording, position: int | None) -> RecordedSensor:
     return sensor
 
 
-def _solve(
-    periods: Sequence[StationaryPeriod], options: argparse.Namespace
-) -> tuple[Poses, Identified | None, str | None]:
+def _solve(periods: Sequence[StationaryPeriod], magnitude: float) -> tuple[Poses, Identified | None, str]:
     """The periods that are poses, and the result, or why there is none, or why it needs motion."""
-    poses: list[tuple[StationaryPeriod, Pose]] = []
-    error: str | None = f"the sensor is never stationary for {LEAST_S:g} s: hold it still"
+    poses = list[tuple[StationaryPeriod, Pose]]()
+    error = f"the sensor is never stationary for {LEAST_S:g} s: hold it still"
     for period in periods:
         try:
-            poses.append((period, pose_of(period.means, magnitude=options.gravity or STANDARD_GRAVITY)))
+            poses.append((period, pose_of(period.means, magnitude=magnitude)))
         except CompensationError as refusal:
             error = str(refusal)
     if not poses:
         return poses, None, error
     try:
-        return poses, identify([pose for _, pose in poses]), None
-    except TooVagueError as refusal:
-        return poses, refusal.result, str(refusal)
+        return poses, identify([pose for _, pose in poses]), ""
     except CompensationError as refusal:
-        return poses, None, str(refusal)
+        return poses, refusal.result if isinstance(refusal, TooVagueError) else None, str(refusal)

@@ -8,12 +8,12 @@ must pass the same test as a pose that is taken live.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from bota_clients.recording.columns import Bools, Columns, Floats
+from bota_clients.recording.columns import Columns, Floats
 from bota_ethercat.sensor.rest import StationaryLimits
 from bota_ethercat.stream.usable import ACCELERATION, ANGULAR_RATE, FORCE_TORQUE
 from bota_ft_compensation.identification.resampling import GAP_S, stretches
@@ -39,53 +39,57 @@ class StationaryPeriod(NamedTuple):
     means: StationaryMeans
 
 
-def find_stationary_periods(
-    parts: Iterable[Columns], least_seconds: float = LEAST_S
-) -> tuple[list[StationaryPeriod], list[str]]:
-    """The stationary periods of at least `least_seconds`, in order; sentences about those that nearly are."""
-    found = _Finder(least_seconds)
-    for part in parts:
-        found.add(part)
-    found.end_stretch()
-    return found.periods, found.rejected
+_TIME, _ROW, _GOOD = 0, slice(1, 13), 13  # columns of a table of samples
 
 
-def usable_rows(columns: Columns) -> tuple[Floats, Bools]:
-    """(n, 12) force, torque, acceleration, angular rate; (n,) whether they may be used."""
-    rows = np.hstack([columns.force, columns.torque, columns.acceleration, columns.angular_rate])
-    flagged = sum(channel.flagged(columns) for channel in (FORCE_TORQUE, ACCELERATION, ANGULAR_RATE))
-    good: Bools = np.isfinite(rows).all(axis=1) & (flagged == 0)
-    return rows, good
+def tables_of(batches: Iterable[Columns]) -> Iterator[Floats]:
+    """Of the new samples of each batch a table (n, 14), that of a batch without samples left out.
+
+    Times, s since the first sample; force, torque, acceleration, angular rate, 0 where they may not be used;
+    whether they may be used.
+    """
+    begin_ns = None
+    for batch in batches:
+        fresh = batch.where(batch.fresh)
+        if not len(fresh):
+            continue
+        begin_ns = int(fresh.monotonic_ns[0]) if begin_ns is None else begin_ns
+        rows = np.hstack([fresh.force, fresh.torque, fresh.acceleration, fresh.angular_rate])
+        flagged = sum(channel.flagged(fresh) for channel in (FORCE_TORQUE, ACCELERATION, ANGULAR_RATE))
+        good = np.isfinite(rows).all(axis=1) & (flagged == 0)
+        rows[~good] = 0.0
+        yield np.column_stack([(fresh.monotonic_ns - begin_ns) * 1e-9, rows, good])
 
 
-_TIME, _GOOD, _ROW = 0, 1, slice(2, None)  # columns of what `_Finder` holds
+def usable(table: Floats) -> Floats:
+    """(k, 13) the samples of a table that may be used: times and values."""
+    return table[table[:, _GOOD] > 0, :_GOOD]
 
 
-class _Finder:
-    """Finds the periods while samples come; holds those of the period that goes on."""
+class StationaryPeriods:
+    """Finds the periods of at least `least_s` while tables of samples come; holds those of the latest one.
 
-    def __init__(self, least_seconds: float) -> None:
-        self.periods, self.rejected = list[StationaryPeriod](), list[str]()
-        self._least_s, self._begin_ns = least_seconds, -1
+    Attributes:
+        found: the periods, in order.
+        rejected: sentences about those that nearly are.
+    """
+
+    def __init__(self, least_s: float = LEAST_S) -> None:
+        self.found, self.rejected = list[StationaryPeriod](), list[str]()
+        self._least_s = least_s
         self._rest, self._held = np.zeros((0, 14)), list[Floats]()  # of no whole block yet; of the period
         self._size = 0  # samples in a block; 0: to be told by the first ones of the stretch
         self._last_s = -math.inf
 
-    def add(self, frames: Columns) -> None:
-        fresh = frames.where(frames.fresh)
-        if not len(fresh):
-            return
-        self._begin_ns = int(fresh.monotonic_ns[0]) if self._begin_ns < 0 else self._begin_ns
-        rows, good = usable_rows(fresh)
-        times = (fresh.monotonic_ns - self._begin_ns) * 1e-9
-        table = np.column_stack([times, good, np.where(good[:, np.newaxis], rows, 0.0)])
-        for part in stretches(np.append(self._last_s, times), GAP_S):
+    def add(self, table: Floats) -> None:
+        """The next of `tables_of`."""
+        for part in stretches(np.append(self._last_s, table[:, _TIME]), GAP_S):
             if part.start:
                 self.end_stretch()
             self._rest = np.concatenate([self._rest, table[max(part.start - 1, 0) : part.stop - 1]])
             if self._size or len(self._rest) >= _ENOUGH:
                 self._take()
-        self._last_s = float(times[-1])
+        self._last_s = float(table[-1, _TIME])
 
     def end_stretch(self) -> None:
         """A gap, or the end."""
@@ -106,28 +110,27 @@ class _Finder:
         quiet = blocks[:, :, _GOOD].all(axis=1) & (deviation <= _LIMITS.deviations).all(axis=1)
         quiet &= np.linalg.norm(mean[:, 9:12], axis=1) <= _LIMITS.angular_rate
         for number in range(count):
-            if not self._continues(quiet[number], mean[number], deviation[number]):
+            if not (quiet[number] and self._continues(mean[number], deviation[number])):
                 self._end_period()
-                self._start = quiet[number], mean[number], deviation[number]
-            self._held.append(blocks[number])
+                self._start = mean[number], deviation[number]
+            if quiet[number]:
+                self._held.append(blocks[number])
 
-    def _continues(self, is_quiet: bool, mean: Floats, deviation: Floats) -> bool:
-        """Whether a block belongs to the period that goes on."""
+    def _continues(self, mean: Floats, deviation: Floats) -> bool:
+        """Whether a quiet block belongs to the period that goes on."""
         if not self._held or len(self._held) * self._size >= _MOST_SAMPLES:
             return False
-        was_quiet, a, its_deviation = self._start
-        if not (was_quiet and is_quiet):
-            return False
-        sizes = float(np.linalg.norm(a[6:9]) * np.linalg.norm(mean[6:9]))
-        if float(a[6:9] @ mean[6:9]) < _SAME_POSE * sizes:
+        at_first, its_deviation = self._start
+        sizes = float(np.linalg.norm(at_first[6:9]) * np.linalg.norm(mean[6:9]))
+        if float(at_first[6:9] @ mean[6:9]) < _SAME_POSE * sizes:
             return False
         by_chance = CHANCE * (its_deviation + deviation) / math.sqrt(self._size)
-        moved = np.abs(mean - a) - by_chance
+        moved = np.abs(mean - at_first) - by_chance
         return bool((moved[:6] <= _LIMITS.drifts[:6]).all())  # of the acceleration the pose was compared
 
     def _end_period(self) -> None:
         held, self._held = self._held, []
-        if len(held) < 3 or not self._start[0]:
+        if len(held) < 3:
             return
         rows = np.concatenate(held[1:-1])
         first_s, last_s = rows[[0, -1], _TIME].tolist()
@@ -139,4 +142,4 @@ class _Finder:
             self.rejected.append(f"{first_s:.1f} s to {last_s:.1f} s: {error}")
         else:
             means = means._replace(time_s=first_s + 0.5 * (last_s - first_s))
-            self.periods.append(StationaryPeriod(first_s, last_s - first_s, means))
+            self.found.append(StationaryPeriod(first_s, last_s - first_s, means))

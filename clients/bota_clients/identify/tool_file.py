@@ -116,14 +116,6 @@ def read_bota(path: Path) -> tuple[Payload, str]:
     return payload._replace(inertia=tuple(inertia.tolist()), inertia_interval=half), ""
 
 
-def _read_yaml(path: Path) -> Payload:
-    with tool_parameters(path) as found:
-        payload = payload_of(found)
-        if not 0.0 < payload.mass < np.inf:
-            raise ValueError(f"tool_mass is {payload.mass:g}")
-        return payload
-
-
 def _of_the_center(payload: Payload) -> np.ndarray[Any, np.dtype[np.float64]]:
     """kg m² (6,): by how much the inertia about the origin is more than that about the center of gravity."""
     x, y, z = payload.center
@@ -145,6 +137,10 @@ def run(options: argparse.Namespace) -> int:
         if why:
             _say(f"the inertia in {path} is left out: {why}")
     else:
-        write_bota(output, _read_yaml(path))
+        with tool_parameters(path) as found:
+            payload = payload_of(found)
+            if not 0.0 < payload.mass < np.inf:
+                raise ValueError(f"tool_mass is {payload.mass:g}")
+        write_bota(output, payload)
     _say(f"written to {output}")
     return 0
