@@ -258,11 +258,13 @@ def _in_motion(motion: Motion, sensor: RecordedSensor, poses: Identified | None)
     """By what the recording has of motion, beside poses or alone; CompensationError."""
     if any(row.info.settings != sensor.info.settings for row in sensor.history):
         raise CompensationError("settings were changed during the recording")
-    times, rows = motion.rows()
-    if not len(times):
+    samples = motion.rows()
+    if not len(samples[0]):
         raise CompensationError("no sample can be used")
     alignment, imu = align(sensor.info.settings, sensor.info.rate_hz), imu_position(sensor.info.name)
-    return identify_in_motion(turn(times, rows, alignment, EXACT, imu), imu, poses)
+    turned = turn(*samples, alignment, EXACT, imu)
+    del samples  # there may be many
+    return identify_in_motion(turned, imu, poses)
 
 
 def choose(recording: Recording, position: int | None) -> RecordedSensor:
