@@ -514,6 +514,11 @@ def test_every_type_that_a_table_can_hold(tmp_path: Path, empty: int | None) -> 
         assert good is False or f"row {empty} (counted from 0) is empty" in said, name
 
 
+def test_a_sample_whose_time_has_no_date_is_no_warning() -> None:
+    refused = str(Stamped(np.array([START_NS])).refusal(0, 1 << 63, 1 << 64))
+    assert "the first sample was measured at 2262-04-11T23:47:16.854775807Z" in refused
+
+
 @pytest.mark.parametrize(
     ("rows", "arguments", "said"),
     [

@@ -230,7 +230,8 @@ class Stamped:
                 f"{source} is before the row above it, and the server's clock was not set then: sort the rows"
             )
         which, bound = ("first", begin_ns) if stamps[row] < begin_ns else ("last", end_ns)
-        taken, limit = np.array([stamps[row], bound]).astype("datetime64[ns]")
+        nearest = min(max(bound, _FIRST + 1), -_FIRST - 1)  # that has a date
+        taken, limit = np.array([stamps[row], nearest]).astype("datetime64[ns]")
         what = f"leave the row out, or find the offset of its clock with '{_ALIGN}'"
         if not stamps[row]:
             what = "its time was not set (0): leave the row out"
