@@ -107,7 +107,9 @@ def cost(root: Path, code: str, *arguments: str) -> tuple[float, float]:
         sys.executable, [sys.executable, "-c", text, *arguments], environment,
         file_actions=[(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0), (os.POSIX_SPAWN_DUP2, 1, 2)],
     )  # fmt: skip
-    _, _, used = os.wait4(process, 0)
+    _, status, used = os.wait4(process, 0)
+    if status:
+        raise SystemExit(f"this fails in {root}:{code}")
     return float(Path(arguments[1]).read_text()), used.ru_maxrss / 1024
 
 
